@@ -16,10 +16,10 @@ PACKAGE = Path(__file__).resolve().parent
 
 
 def recipes_folder() -> Path:
-    """Where the recipes are.
+    """Return the folder of the recipes.
 
     Raises:
-        FileNotFoundError: this installation has none.
+        FileNotFoundError: This installation has none.
     """
     for folder in (PACKAGE / "recipes", PACKAGE.parent / "recipes"):
         if (folder / "composing").is_dir():
@@ -28,7 +28,7 @@ def recipes_folder() -> Path:
 
 
 def usage(folder: Path) -> Iterator[str]:
-    """Yield the lines of the help: every recipe, and what it says of itself first."""
+    """Yield the lines of the help: every recipe with the first line of its docstring."""
     yield from ("usage: python -m dreamer_racing RECIPE [NAME=VALUE ...]", "")
     for path in sorted(folder.glob("*.py")):
         said = ast.get_docstring(ast.parse(path.read_text(encoding="utf-8"))) or ""
@@ -49,7 +49,7 @@ def main() -> None:
         sys.stderr.write(f"error: {name}: no such recipe{suggestion(name, names)}; {', '.join(names)}.\n")
         raise SystemExit(2)
     script = str(folder / f"{name}.py")
-    sys.path.insert(0, str(folder))  # where a script's own folder is
+    sys.path.insert(0, str(folder))  # as Python does for a script
     sys.argv = [script, *overrides]
     runpy.run_path(script, run_name="__main__")
 

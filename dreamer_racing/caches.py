@@ -1,6 +1,6 @@
-"""Folders in which libraries keep what they compile: those of the home, or temporary ones where it takes no files.
+"""Cache folders of Warp and Matplotlib: their own, or a temporary one where their own is not writable.
 
-A container started with another user's number, a Slurm node and a service often have no home that can be written to.
+A container that runs under another user ID, a Slurm node and a service often have no writable home directory.
 """
 
 from __future__ import annotations
@@ -19,20 +19,20 @@ logger = logging.getLogger(__name__)
 
 
 class CacheError(OSError):
-    """There is no folder for what warp compiles; the message says what to set."""
+    """Raised if no folder can hold Warp's compiled kernels; the message says what to set."""
 
 
 @cache
 def ensure_caches() -> str:
-    """Let warp and Matplotlib use a private temporary folder where their own cannot be written to, and say so, once.
+    """Let Warp and Matplotlib use a temporary folder if Warp's own cache is not writable; log one warning.
 
-    To be called before either is imported. The folder is removed when this process ends; those that it starts use it.
+    Call it before importing either. The folder is removed when this process ends; its child processes use it, too.
 
     Returns:
-        Why the own folder is not used; nothing where it is.
+        Why Warp's own folder is not used; empty if it is used.
 
     Raises:
-        CacheError: no temporary folder can be made either.
+        CacheError: No temporary folder can be made either.
     """
     folder = warp_cache()
     reason = why_not_writable(folder)
@@ -58,7 +58,7 @@ def ensure_caches() -> str:
 
 
 def warp_cache() -> Path:
-    """Return the folder in which warp would keep what it compiles."""
+    """Return the folder in which Warp caches its compiled kernels."""
     version = importlib.metadata.version("warp-lang")
     if named := os.environ.get("WARP_CACHE_PATH"):
         return Path(named).absolute() / version
@@ -70,7 +70,7 @@ def warp_cache() -> Path:
 
 
 def why_not_writable(folder: Path) -> str:
-    """Try to write to a folder, which is made if it is missing; return why that cannot be, nothing if it can."""
+    """Return why a folder is not writable, or an empty string if it is; a missing folder is created."""
     if str(folder).startswith("~"):
         return "this user has no home"
     try:
@@ -83,6 +83,6 @@ def why_not_writable(folder: Path) -> str:
 
 
 def _remove(folder: Path, process: int) -> None:
-    """Remove a folder at the end of the process that made it, not of one that was forked from it."""
+    """Remove a folder if this is the process that made it, not one forked from it."""
     if os.getpid() == process:
         shutil.rmtree(folder, ignore_errors=True)

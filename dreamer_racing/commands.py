@@ -1,4 +1,4 @@
-"""Commands in messages: as they work from where the person stands, with the Python that is running."""
+"""Shell commands for messages, valid in the current working directory and for the running Python."""
 
 from __future__ import annotations
 
@@ -8,19 +8,19 @@ import sys
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[1]
-"""Of the clone, where this is one."""
+"""Root of the clone, if the package runs from one."""
 MADE_BY_DEV = "dreamer_racing.place"
-"""What `./dev` leaves in an environment that it made."""
+"""Name of the marker file that `./dev` writes into an environment that it made."""
 
 
 def from_here(path: str | Path) -> str:
-    """Return a path as one would type it: relative where it lies below the working directory."""
+    """Return a path as one would type it: relative if it lies below the working directory, else absolute."""
     path, here = Path(path).absolute(), Path.cwd()
     return str(path.relative_to(here)) if path.is_relative_to(here) else str(path)
 
 
 def dev() -> str:
-    """Return `./dev`, from here, and a space, if the Python that is running is its environment's; else nothing."""
+    """Return the path of `./dev` and a space if the running Python is in an environment made by it, else nothing."""
     if not ((ROOT / "dev").is_file() and (Path(sys.prefix) / MADE_BY_DEV).is_file()):
         return ""
     near = from_here(ROOT / "dev")
@@ -28,7 +28,7 @@ def dev() -> str:
 
 
 def python() -> str:
-    """Return what starts the Python that is running: `python`, where a shell would find this one by that name."""
+    """Return the command of the running Python: `python` if the shell finds this one under that name, else its path."""
     if start := dev():
         return f"{start}python"
     found = shutil.which("python")
@@ -36,7 +36,7 @@ def python() -> str:
 
 
 def install_extra(extra: str) -> str:
-    """Return the command that installs an extra of this project: of the clone, or of the package from an index."""
+    """Return the pip command that installs an extra of this project, from the clone or from the package index."""
     cloned = (ROOT / "pyproject.toml").is_file()
     place = from_here(ROOT) if cloned else "dreamer_racing"
     return f"{dev()}pip install {'-e ' if cloned else ''}'{place}[{extra}]'"

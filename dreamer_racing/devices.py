@@ -1,4 +1,4 @@
-"""On what a recipe computes."""
+"""Choice of the device and of mixed precision."""
 
 import math
 import time
@@ -9,10 +9,10 @@ from dreamer_racing.settings import suggestion
 
 
 def choose_device(device: str) -> torch.device:
-    """Resolve `auto`, and refuse a device that is not there.
+    """Return the device of a name; `auto` is CUDA if available, else the CPU.
 
     Raises:
-        ValueError: not a device of this machine.
+        ValueError: This machine has no such device.
     """
     if device == "auto":
         return torch.device("cuda" if torch.cuda.is_available() else "cpu")
@@ -20,7 +20,7 @@ def choose_device(device: str) -> torch.device:
         chosen = torch.device(device)
         torch.empty(1, device=chosen)
     except (RuntimeError, AssertionError) as error:
-        if "device type at start of device string" in str(error):  # torch names twenty more, for other machines
+        if "device type at start of device string" in str(error):  # torch lists twenty more types
             word = device.partition(":")[0]
             meant = " (did you mean cuda?)" if word == "gpu" else suggestion(word, ("auto", "cpu", "cuda"))
             raise ValueError(f"device={device}: there are auto, cpu, cuda and cuda:1 ...{meant}.") from error
@@ -33,11 +33,11 @@ def choose_device(device: str) -> torch.device:
 
 
 WORTH_ROUNDING = 1.2
-"""Times the speed of float32 from which bfloat16 is taken [choice]: processors are at 0.5 or at 2 and more."""
+"""Smallest speed-up over float32 at which bfloat16 is used [choice]; measured CPUs are at 0.5 or at 2 and more."""
 
 
 def choose_mixed_precision(device: torch.device) -> tuple[bool, str]:
-    """Return whether a device is to compute in bfloat16 where it may, and why."""
+    """Return whether to use mixed precision (bfloat16) on a device, and why."""
     if not computes_bfloat16(device):
         return False, f"this {device.type} device does not compute in bfloat16"
     if device.type == "cuda":
@@ -47,7 +47,7 @@ def choose_mixed_precision(device: torch.device) -> tuple[bool, str]:
 
 
 def computes_bfloat16(device: torch.device) -> bool:
-    """Whether a device has instructions for bfloat16, which on a CPU are not always the faster ones."""
+    """Return whether a device has bfloat16 instructions; on a CPU they are not always faster than float32."""
     if device.type == "cuda":
         return torch.cuda.is_bf16_supported(including_emulation=False)
     capabilities = torch.cpu.get_capabilities()
@@ -55,13 +55,13 @@ def computes_bfloat16(device: torch.device) -> bool:
 
 
 def bfloat16_speed() -> float:
-    """Return how many times as fast as in float32 this CPU multiplies in bfloat16, by a product that is timed.
+    """Return the speed-up of bfloat16 over float32 of a timed matrix product on this CPU.
 
     Intel's `avx512_bf16` without AMX takes twice as long as float32, AMD's half as long.
     """
     factors = {kind: torch.ones(256, 256, dtype=kind) for kind in (torch.float32, torch.bfloat16)}
     seconds = dict.fromkeys(factors, math.inf)
-    for _ in range(200):  # short ones, of which some are never interrupted, whatever else runs
+    for _ in range(200):  # short products, so that some are not interrupted by other processes
         for kind, factor in factors.items():
             start = time.perf_counter()
             torch.mm(factor, factor)

@@ -1,4 +1,4 @@
-"""What a machine has for training and flying, and how what is missing can be had; no torch, which takes its time."""
+"""Checks of a machine for training and flying, with remedies; does not import torch, which is slow."""
 
 from __future__ import annotations
 
@@ -26,11 +26,11 @@ from dreamer_racing.envs.simulator.opengl import GL_LIBRARIES, loads
 
 DISTRIBUTION = "dreamer_racing"
 RECORD_BYTES = 13_570
-"""Of a record of the default run in its replay: image, numbers and latents."""
+"""Size of one replay record of the default run: image, numbers and latents."""
 NETWORKS_BYTES = 1.5e9
-"""What a default run takes beside its replay: networks, optimiser, batch, libraries."""
+"""Memory of a default run beside its replay buffer: networks, optimiser, batch, libraries."""
 SMALLER_ON_DISK = 7
-"""How much smaller a replay of a race is in a checkpoint."""
+"""Compression factor of a race's replay buffer in a checkpoint."""
 PROBE = """
 import sys, time
 import numpy as np
@@ -47,16 +47,16 @@ while time.monotonic() < end:
 print(frames)
 eyes.close()
 """
-"""Counts the images of one second by an OpenGL back end, in a process of its own: two do not go together in one."""
+"""Program that counts the images that an OpenGL back end renders in 1 s; two back ends cannot share a process."""
 
 
-PATIENCE = 15  # s
+PATIENCE = 15  # timeout of a probe, s
 SHOWN = ("torch", "torchrl", "tensordict", "mujoco", "mujoco-warp", "warp-lang", "dm-control")
-"""Packages whose versions are said also where they are right."""
+"""Packages whose versions are also reported if they are right."""
 
 
 class Verdict(Enum):
-    """Whether something is as it should be."""
+    """Outcome of a check."""
 
     fine = "ok"
     note = "note"
@@ -64,7 +64,7 @@ class Verdict(Enum):
 
 
 class Diagnosis(NamedTuple):
-    """What was looked at, how it is, and what to do about it."""
+    """Result of one check: its subject, its outcome, what was found, and the remedy."""
 
     what: str
     state: Verdict
@@ -73,12 +73,12 @@ class Diagnosis(NamedTuple):
 
 
 def examine(capacity: int, keep: int, run_dir: Path) -> Iterator[Diagnosis]:
-    """Look at everything.
+    """Run all checks and yield their results.
 
     Args:
-        capacity: records of the replay.
-        keep: checkpoints.
-        run_dir: where runs are to go.
+        capacity: Records that the replay buffer holds.
+        keep: Number of checkpoints kept.
+        run_dir: Folder of the runs.
     """
     probes = {backend: _start_probe(backend) for backend in GL_LIBRARIES}
     yield python()
@@ -93,7 +93,7 @@ def examine(capacity: int, keep: int, run_dir: Path) -> Iterator[Diagnosis]:
 
 
 def python() -> Diagnosis:
-    """Look at the interpreter."""
+    """Check the version of the Python interpreter."""
     wanted = importlib.metadata.metadata(DISTRIBUTION)["Requires-Python"]
     fits = platform.python_version() in SpecifierSet(wanted)
     remedy = "" if fits else f"PYTHON=/path/to/python{wanted} ./dev ..."
@@ -101,7 +101,7 @@ def python() -> Diagnosis:
 
 
 def packages() -> Iterator[Diagnosis]:
-    """Look at every package that the project requires, and at which extras are complete."""
+    """Check every package that the project requires, and list the extras that are completely installed."""
     extras: dict[str, list[str]] = {}
     for text in requirements():
         requirement = Requirement(text)
@@ -123,15 +123,15 @@ def packages() -> Iterator[Diagnosis]:
 
 
 def requirements() -> Iterator[str]:
-    """Yield what the project requires, and Warp as mujoco-warp requires it: it is Warp that meets the GPU's driver."""
+    """Yield the project's requirements, and mujoco-warp's of Warp, since Warp's version must fit the GPU driver."""
     yield from importlib.metadata.requires(DISTRIBUTION) or ()
-    with suppress(importlib.metadata.PackageNotFoundError):  # then mujoco-warp is what is missing
+    with suppress(importlib.metadata.PackageNotFoundError):  # then mujoco-warp itself is reported as missing
         of_warp = importlib.metadata.requires("mujoco-warp") or ()
         yield from (text for text in of_warp if text.startswith("warp-lang") and ";" not in text)
 
 
 def version_of(package: str) -> str | None:
-    """Return the version of what is installed, without its local part; None if it is not."""
+    """Return the version of an installed package without its local part; None if it is not installed."""
     try:
         return importlib.metadata.version(package).partition("+")[0]
     except importlib.metadata.PackageNotFoundError:
@@ -139,7 +139,7 @@ def version_of(package: str) -> str | None:
 
 
 def accelerator() -> Iterator[Diagnosis]:
-    """Look for a GPU, its driver, and a torch that can use it."""
+    """Check for an NVIDIA GPU, its driver, and a torch build that can use it."""
     query = ["nvidia-smi", "--query-gpu=name,driver_version,memory.total", "--format=csv,noheader"]
     try:
         answer = subprocess.run(query, capture_output=True, text=True, check=True, timeout=5).stdout.splitlines()
@@ -163,7 +163,7 @@ def cuda_of_torch() -> str | None:
 
 
 def cores() -> Iterator[Diagnosis]:
-    """Look at the cores, at who else uses them, and at how many threads torch will start."""
+    """Check the CPU cores, their load, the number of threads of torch, and bfloat16 instructions."""
     available = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
     load = os.getloadavg()[0]
     busy = load > 0.5 * available
@@ -171,7 +171,7 @@ def cores() -> Iterator[Diagnosis]:
     found = f"{available}, load {load:.1f}"
     yield Diagnosis("cores", Verdict.note if busy else Verdict.fine, found, remedy if busy else "")
     threads = os.environ.get("OMP_NUM_THREADS")
-    outside = (threads or "").partition(",")[0].strip()  # of "4,2"; without `machine`, which imports torch
+    outside = (threads or "").partition(",")[0].strip()  # outer number of "4,2"; not by `machine`, which imports torch
     too_many = outside.isdecimal() and int(outside) > available
     found = f"OMP_NUM_THREADS={threads}" if threads else "as many as cores"
     remedy = f"OMP_NUM_THREADS={available}: more threads than cores wait for each other" if too_many else ""
@@ -183,7 +183,7 @@ def cores() -> Iterator[Diagnosis]:
 
 
 def memory(needed: float) -> Diagnosis:
-    """Look whether a run fits."""
+    """Check that a run fits in memory; ``needed`` is in bytes."""
     information = Path("/proc/meminfo")
     if not information.exists():
         return Diagnosis("memory", Verdict.note, f"a default run takes {needed / 1e9:.1f} GB")
@@ -195,7 +195,7 @@ def memory(needed: float) -> Diagnosis:
 
 
 def disk(needed: float, run_dir: Path) -> Diagnosis:
-    """Look whether checkpoints can be written, and fit."""
+    """Check that checkpoints can be written and fit on the disk; ``needed`` is in bytes."""
     place = next(folder for folder in (run_dir.absolute(), *run_dir.absolute().parents) if folder.is_dir())
     if reason := why_not_writable(place):
         return Diagnosis("disk", Verdict.wrong, f"{place} takes no files ({reason})", "choose another run_dir=")
@@ -205,7 +205,7 @@ def disk(needed: float, run_dir: Path) -> Diagnosis:
 
 
 def caches() -> Diagnosis:
-    """Look whether what is compiled can be kept for the next program."""
+    """Check that compiled kernels can be cached for the next program."""
     if reason := ensure_caches():
         remedy = "WARP_CACHE_PATH=FOLDER, or a HOME that can be written to; until then every program compiles anew"
         return Diagnosis("caches", Verdict.note, reason, remedy)
@@ -217,7 +217,7 @@ def _enough(found: str, enough: bool, remedy: str) -> tuple[Verdict, str, str]:
 
 
 def renderers(probes: dict[str, subprocess.Popen[str]]) -> Iterator[Diagnosis]:
-    """Look at what draws images, and how fast."""
+    """Check which renderers work, and how fast they are."""
     found, reasons = {}, {}
     for backend, probe in probes.items():
         try:
@@ -244,7 +244,7 @@ def renderers(probes: dict[str, subprocess.Popen[str]]) -> Iterator[Diagnosis]:
 
 
 def variables() -> Iterator[Diagnosis]:
-    """Look for variables that are in the way of OpenGL, and were left out of account."""
+    """Report environment variables that would break OpenGL and were therefore ignored."""
     for setting, reason in refused.items():
         name = setting.partition("=")[0]
         yield Diagnosis(name, Verdict.note, f"{setting} is left out of account: {reason}", f"unset {name}")

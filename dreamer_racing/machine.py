@@ -1,4 +1,4 @@
-"""The machine: its cores and memory, and what it says about itself beside numbers that were measured on it."""
+"""The machine: its cores and memory, and its description beside measurements."""
 
 from __future__ import annotations
 
@@ -22,15 +22,15 @@ _M_TRIM_THRESHOLD, _M_MMAP_MAX = -1, -4  # glibc, malloc.h
 
 
 def keep_freed_memory() -> bool:
-    """Let this process keep what it frees instead of returning it to the kernel.
+    """Make this process keep freed memory instead of returning it to the kernel.
 
-    glibc gives blocks of many megabytes back at once and asks for them anew at the next operation, and the kernel
-    fills every page with zeros each time: a third of the update of a large model on a CPU
-    (``benchmarks/learner.py --return-freed-memory`` shows it). The process stays as large as it once was, or
-    grows on: `KeptMemory` is for that. An allocator preloaded in place of glibc's does as it likes.
+    By default glibc returns blocks of many megabytes at once and requests them again at the next operation, and the
+    kernel zeroes every page each time: a third of the time of a large model's update on a CPU
+    (``benchmarks/learner.py --return-freed-memory`` measures it). With this setting the process never shrinks and may
+    grow; `KeptMemory` limits that. Has no effect on an allocator that is preloaded in place of glibc's.
 
     Returns:
-        Whether the C library took the setting; only glibc does.
+        Whether the C library accepted the setting; only glibc does.
     """
     if sys.platform == "win32":
         return False
@@ -39,24 +39,23 @@ def keep_freed_memory() -> bool:
 
 
 class KeptMemory:
-    """Gives back what a process keeps of its freed memory, when that has grown beyond what it uses again and again.
+    """Returns a process's freed memory to the kernel when the process has grown by more than ``growth``.
 
-    Blocks of many sizes that come and go, aligned ones above all (before glibc 2.38), leave gaps in a heap that is
-    never given back, and it grows without end: a training of the Control Suite was at 19 GB after 8,600 updates, of
-    which one was in use. Giving back all of it takes a fraction of a second, and what is used comes back with the next
-    update.
+    Allocations of many sizes, above all aligned ones (before glibc 2.38), fragment a heap that is never returned, and
+    it grows without bound: a training on the Control Suite held 19 GB after 8,600 updates, of which 1 GB was in use.
+    Returning all of it takes a fraction of a second, and the next update allocates again what it uses.
 
     Args:
-        growth: bytes by which the process may grow before it does [choice].
+        growth: Bytes by which the process may grow before its freed memory is returned [choice].
     """
 
     def __init__(self, growth: int = 1 << 30) -> None:
         self._growth = growth
-        self._usual: int | None = None  # bytes, once what was given back and is used has come back
+        self._usual: int | None = None  # size in bytes at the first call after memory was returned
         self._trim = getattr(ctypes.CDLL(None), "malloc_trim", None) if sys.platform == "linux" else None
 
     def trim(self) -> bool:
-        """Look at how large the process is, now and then; return whether memory was given back."""
+        """Return freed memory if the process has grown too large; return whether it was done. Call it regularly."""
         size = resident_memory()
         if self._trim is None or size is None:
             return False
@@ -70,13 +69,13 @@ class KeptMemory:
 
 
 def resident_memory() -> int | None:
-    """Return the bytes of memory that this process has; None where nothing tells (no /proc)."""
+    """Return the resident memory of this process in bytes; None without /proc."""
     statm = Path("/proc/self/statm")
     return int(statm.read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE") if statm.exists() else None
 
 
 def available_memory(device: torch.device | str) -> float:
-    """Return the bytes that can still be allocated on a device; infinity where nothing tells (a CPU without /proc)."""
+    """Return the bytes that can still be allocated on a device; infinity if unknown (a CPU without /proc)."""
     device = torch.device(device)
     if device.type == "cuda":
         return float(torch.cuda.mem_get_info(device)[0])
@@ -88,15 +87,15 @@ def available_memory(device: torch.device | str) -> float:
 
 
 def check_fits(size: int, device: torch.device | str, setting: str) -> None:
-    """Refuse what is larger than the memory that is left.
+    """Check that an allocation fits in the free memory of a device.
 
     Args:
-        size: bytes.
-        device: where.
-        setting: what asks for it, as the user wrote it.
+        size: Bytes.
+        device: Where to allocate.
+        setting: The setting that asks for it, as the user wrote it.
 
     Raises:
-        ValueError: the message gives both numbers and what to change.
+        ValueError: It does not fit; the message gives both numbers and what to change.
     """
     available = available_memory(device)
     if size > available:
@@ -107,15 +106,15 @@ def check_fits(size: int, device: torch.device | str, setting: str) -> None:
 
 
 def check_space(size: int, folder: Path, setting: str) -> None:
-    """Refuse files that are larger than what is free on the disk: writing them by a memory map would end the process.
+    """Check that files fit on the disk: a memory map that runs out of disk space would kill the process.
 
     Args:
-        size: bytes, of all of them when full.
-        folder: where; it need not be there yet.
-        setting: what asks for them, as the user wrote it.
+        size: Bytes of all files when full.
+        folder: Folder of the files; it need not exist yet.
+        setting: The setting that asks for them, as the user wrote it.
 
     Raises:
-        ValueError: the message gives both numbers and what to change.
+        ValueError: They do not fit; the message gives both numbers and what to change.
     """
     place = next(above for above in (folder.absolute(), *folder.absolute().parents) if above.exists())
     free = shutil.disk_usage(place).free
@@ -127,12 +126,12 @@ def check_space(size: int, folder: Path, setting: str) -> None:
 
 
 def is_out_of_memory(error: RuntimeError) -> bool:
-    """Whether torch failed for want of memory, of a CUDA device or of the CPU."""
+    """Return whether an error of torch means that a CUDA device or the CPU is out of memory."""
     return isinstance(error, torch.OutOfMemoryError) or "can't allocate memory" in str(error)
 
 
 def out_of_memory_advice(error: RuntimeError) -> str:
-    """Return the first line of the error, and which settings take memory, largest first."""
+    """Return the first line of an out-of-memory error, and the settings that take memory, largest first."""
     first = str(error).splitlines()[0]
     return (
         f"{first} What takes memory: the batch (model.batch_size times model.batch_length), imagination, if any "
@@ -145,7 +144,7 @@ PACKAGES = ("torch", "torchrl", "tensordict", "mujoco", "mujoco-warp")
 
 
 def provenance() -> dict[str, Any]:
-    """Return machine, versions and commit, as JSON knows them."""
+    """Return machine, versions and commit as values that JSON can hold."""
     return {
         "machine": f"{platform.system()} {platform.machine()}, {_cpu()}, {torch.get_num_threads()} torch threads",
         "gpu": torch.cuda.get_device_name() if torch.cuda.is_available() else None,
@@ -156,13 +155,13 @@ def provenance() -> dict[str, Any]:
 
 
 def git_commit(folder: Path) -> str | None:
-    """Name the commit that a folder is at, ``-dirty`` if files have changed since; None if no repository has its files.
+    """Return the commit of a folder, with ``-dirty`` if files have changed since; None if git does not track its files.
 
-    An installed package may well lie below a repository, of somebody else's work.
+    An installed package may lie inside the repository of another project.
     """
     try:
         return _git(folder, "describe", "--always", "--dirty") if _git(folder, "ls-files", ".") else None
-    except OSError:  # no git here
+    except OSError:  # git is not installed
         return None
 
 
@@ -172,7 +171,7 @@ def _git(folder: Path, *arguments: str) -> str | None:
 
 
 def command_line() -> str:
-    """Return the command that started this process, to be run again in the same folder."""
+    """Return the command that starts this process again from the same folder."""
     return shlex.join(["python", *sys.argv])
 
 
@@ -184,14 +183,14 @@ def _cpu() -> str:
 
 
 def available_cpus() -> int:
-    """CPUs this process may run on."""
+    """Return the number of CPUs that this process may run on."""
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 def usable_threads() -> int:
-    """Threads of physics and rendering where nobody says how many: one for each CPU, at most ``OMP_NUM_THREADS``.
+    """Return the default number of threads for physics and rendering: one for each CPU, at most ``OMP_NUM_THREADS``.
 
-    By that variable, which torch obeys, too, two trainings share a machine.
+    torch obeys that variable, too, so it divides a machine between two trainings.
     """
-    asked = os.environ.get("OMP_NUM_THREADS", "").partition(",")[0].strip()  # "4,2": 4 outside, 2 within each
+    asked = os.environ.get("OMP_NUM_THREADS", "").partition(",")[0].strip()  # "4,2": 4 outer threads, 2 nested in each
     return min(available_cpus(), int(asked)) if asked.isdecimal() and int(asked) else available_cpus()

@@ -1,11 +1,11 @@
-"""Several processes that train one agent: each has a share of worlds, replay and batch, and all have the same networks.
+"""Data-parallel training: each process has a share of the environments, the replay and the batch, and equal networks.
 
-This module alone knows that there are several; ``torchrun`` starts them, and ``join`` finds them. Until then, and where
-there is a single one, every function returns what it was given, and nothing of ``torch.distributed`` runs. What is
-reduced over the processes and what is not: docs/scaling.md.
+``torchrun`` starts the processes, and ``join`` connects them; no other module uses ``torch.distributed``. Before
+``join``, and with a single process, every function returns its argument. docs/scaling.md lists what is reduced over
+the processes and what is not.
 
-All processes must come to the same calls in the same order. So whatever decides how a run goes on (a divergence that
-ends epochs, a signal, a minute that has passed) has to be agreed on first.
+All processes must make the same calls in the same order. So every decision about how a run continues (a KL divergence
+that ends the epochs, a signal, a timer) must first be made equal in all processes, by ``agreed`` or a reduction.
 """
 
 from __future__ import annotations
@@ -22,11 +22,11 @@ from torch import Tensor
 
 T = TypeVar("T")
 PATIENCE = timedelta(days=1)
-"""For the others, while one evaluates or saves; ``torchrun`` ends whoever waits for one that is gone."""
+"""Timeout of a wait, long enough for one process to evaluate or save; ``torchrun`` ends all if one dies."""
 
 
 class _Place:
-    """Which process this is, of how many."""
+    """Rank of this process, and the number of processes."""
 
     rank = 0
     processes = 1
@@ -36,15 +36,15 @@ _here = _Place()
 
 
 def asked_for() -> int:
-    """How many processes were started, whether they have met or not."""
+    """Return how many processes ``torchrun`` started, whether they are connected or not."""
     return int(os.environ.get("WORLD_SIZE") or 1)
 
 
 def join() -> None:
-    """Meet the other processes, if there are any: on CUDA devices by NCCL, on the CPU by Gloo.
+    """Initialise the process group, if there are several processes: NCCL for CUDA devices, Gloo for the CPU.
 
     Raises:
-        ValueError: ``WORLD_SIZE`` says that there are, but not where they meet.
+        ValueError: ``WORLD_SIZE`` is set, but not the address of the process group.
     """
     if asked_for() == 1 or _here.processes > 1:
         return
@@ -62,34 +62,34 @@ def join() -> None:
 
 
 def leave() -> None:
-    """Part from the others."""
+    """Destroy the process group."""
     if _here.processes > 1:
         _here.rank, _here.processes = 0, 1
         dist.destroy_process_group()
 
 
 def count() -> int:
-    """How many processes train together; 1: this one alone."""
+    """Return the number of processes that train together; 1 for this one alone."""
     return _here.processes
 
 
 def count_here() -> int:
-    """How many of them are on this machine."""
+    """Return the number of processes on this machine."""
     return min(count(), int(os.environ.get("LOCAL_WORLD_SIZE", count())))
 
 
 def rank() -> int:
-    """Which of them this is, from 0."""
+    """Return the rank of this process, from 0."""
     return _here.rank
 
 
 def is_first() -> bool:
-    """Whether this is the one that logs, evaluates and saves."""
+    """Return whether this is the process that logs, evaluates and saves (rank 0)."""
     return _here.rank == 0
 
 
 def average_(values: Iterable[Tensor]) -> None:
-    """Replace tensors of one device by their mean over the processes, in a single exchange."""
+    """Replace tensors of one device by their mean over the processes, in a single all-reduce."""
     tensors = list(values)
     if _here.processes == 1 or not tensors:
         return
@@ -101,16 +101,16 @@ def average_(values: Iterable[Tensor]) -> None:
 
 
 def average_gradients(parameters: Iterable[Tensor], metrics: Mapping[str, Tensor] | None = None) -> dict[str, Tensor]:
-    """Make gradients the means over the processes, in place: those of the joint batch.
+    """Average gradients over the processes, in place, to those of the joint batch.
 
-    That is exact where a loss is a mean over records and the processes' shares of the batch are equal.
+    This is exact if the loss is a mean over records and the processes have equal shares of the batch.
 
     Args:
-        parameters: whose gradients; those that have none are left out, the same ones in all processes.
-        metrics: tensors on the same device that go along in the exchange.
+        parameters: Parameters with the gradients; those without one are skipped, and must be the same in all processes.
+        metrics: Tensors on the same device to average in the same all-reduce.
 
     Returns:
-        The metrics' means.
+        The means of the metrics.
     """
     own = {name: value.clone() for name, value in (metrics or {}).items()}
     average_([*(parameter.grad for parameter in parameters if parameter.grad is not None), *own.values()])
@@ -134,7 +134,7 @@ def total(values: Tensor) -> Tensor:
 
 @torch.no_grad()
 def gathered(values: Tensor, dim: int) -> Tensor:
-    """Return tensors of equal shape side by side, in the order of the processes, without gradient."""
+    """All-gather tensors of equal shape and concatenate them along ``dim`` in the order of ranks, without gradient."""
     if _here.processes == 1:
         return values
     parts = [torch.empty_like(values, memory_format=torch.contiguous_format) for _ in range(_here.processes)]
@@ -143,7 +143,7 @@ def gathered(values: Tensor, dim: int) -> Tensor:
 
 
 def gathered_rows(rows: TensorDictBase) -> TensorDictBase:
-    """Return rows ``[E]`` of all processes, however many each has, one process after the other; on the CPU."""
+    """Concatenate the rows ``[E]`` of all processes in the order of ranks, on the CPU; E may differ among them."""
     if _here.processes == 1:
         return rows
     parts = [TensorDict(part, [length]) for length, part in _gathered_objects((len(rows), rows.to_dict()))]
@@ -151,7 +151,7 @@ def gathered_rows(rows: TensorDictBase) -> TensorDictBase:
 
 
 def agreed(value: T) -> T:
-    """Return what the first process gives, a plain value."""
+    """Broadcast a picklable value of rank 0 to all processes."""
     if _here.processes == 1:
         return value
     box = [value]
@@ -160,7 +160,7 @@ def agreed(value: T) -> T:
 
 
 def largest(value: int) -> int:
-    """Return the largest of the processes' numbers."""
+    """Return the maximum of a number over the processes."""
     if _here.processes == 1:
         return value
     box = torch.tensor(value)
@@ -169,10 +169,10 @@ def largest(value: int) -> int:
 
 
 def together(action: Callable[[], object]) -> None:
-    """Do something, and wait for the others to have done it.
+    """Run an action in every process, and wait until all have finished it.
 
     Raises:
-        RuntimeError: It failed in another process; the message says why. Where it failed in this one, that is raised.
+        RuntimeError: It failed in another process; the message says why. A failure in this one is raised as it is.
     """
     if _here.processes == 1:
         action()
@@ -190,10 +190,10 @@ def together(action: Callable[[], object]) -> None:
 
 
 def check_same(values: Sequence[Tensor]) -> None:
-    """Refuse to go on with networks that have drifted apart.
+    """Check that the networks are still equal in all processes, by the sums of their tensors.
 
     Raises:
-        RuntimeError: The tensors are not the same in all processes, bit for bit.
+        RuntimeError: A sum differs between processes.
     """
     if _here.processes == 1:
         return
@@ -207,7 +207,7 @@ def check_same(values: Sequence[Tensor]) -> None:
 
 
 def _gathered_objects(value: T) -> list[T]:
-    """Return the plain values of all processes, in their order."""
+    """Return the values of all processes, in the order of ranks."""
     box: list[Any] = [None] * _here.processes
     dist.all_gather_object(box, value)
     return box

@@ -1,4 +1,4 @@
-"""What a person sets: numbers and their ranges, checked in one place; names of own code; how messages quote."""
+"""Settings of a user: range checks of numbers, import of user code by name, and quoting for error messages."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ ALLOWED = "allowed"
 
 
 class Range(NamedTuple):
-    """Allowed values of a setting, finite ones: a whole interval, or one without its lower end."""
+    """Interval of the allowed finite values of a setting; ``open_below`` excludes the lower end."""
 
     low: float
     high: float = math.inf
@@ -31,7 +31,7 @@ class Range(NamedTuple):
         return bool(above and value < math.inf and value <= self.high)
 
     def __str__(self) -> str:
-        """Say it in words."""
+        """Describe the range in words."""
         if self == FINITE:
             return "finite"
         below = f"{'above' if self.open_below else 'at least'} {_in_digits(self.low)}"
@@ -39,7 +39,7 @@ class Range(NamedTuple):
 
 
 def is_number(value: object) -> bool:
-    """Whether this is a number, NumPy's too; true and false are none."""
+    """Return whether a value is a real number, of Python or NumPy; booleans are not."""
     return isinstance(value, Real) and not isinstance(value, bool)
 
 
@@ -53,30 +53,29 @@ SHARE, POSITIVE_SHARE = Range(0, 1), Range(0, 1, open_below=True)
 COUNT = Range(1)
 SEED = Range(0, 2**32 - 1)
 _WHOLE = (int, "int", int | None, "int | None")
-"""What fields of whole numbers say of their type."""
+"""Type annotations of fields that hold whole numbers."""
 
 
 def setting(default: Any, allowed: Range) -> Any:
-    """Return a dataclass field with a default and the values that it may have; None is allowed where its type is."""
+    """Return a dataclass field with a default and a range of allowed values, which is not checked for None."""
     return dataclasses.field(default=default, metadata={ALLOWED: allowed})
 
 
 def allowed_values(config: Any, name: str) -> Range | None:
-    """Return what a setting of a dataclass, or of an object of one, may be; None: anything of its type."""
+    """Return the allowed range of a field of a dataclass or its instance; None if it has no range."""
     return next((field.metadata.get(ALLOWED) for field in dataclasses.fields(config) if field.name == name), None)
 
 
 def check_settings(config: Any, prefix: str = "") -> None:
-    """Refuse a number out of its range, and what is none, or not whole where it should be.
-
-    Of a dataclass, and of those within it: fields that `setting` made.
+    """Check all fields made by `setting`, of a dataclass and those nested in it.
 
     Args:
-        config: an object of a dataclass.
-        prefix: of the settings' names, for the message.
+        config: Instance of a dataclass.
+        prefix: Prefix of the settings' names in the message.
 
     Raises:
-        ValueError: the message gives the setting, its value, and what is allowed.
+        ValueError: A value is not a number, out of its range, or not whole where it must be; the message gives the
+            setting, its value, and what is allowed.
     """
     for field in dataclasses.fields(config):
         value, allowed = getattr(config, field.name), field.metadata.get(ALLOWED)
@@ -87,16 +86,16 @@ def check_settings(config: Any, prefix: str = "") -> None:
 
 
 def check_setting(name: str, value: object, allowed: Range, whole: bool = False) -> None:
-    """Refuse a number out of its range, and what is none.
+    """Check that a value is a number in a range.
 
     Args:
-        name: of the setting, for the message.
-        value: of it.
-        allowed: what it may be.
-        whole: whether it must be a whole number.
+        name: Name of the setting, for the message.
+        value: Value of the setting.
+        allowed: Allowed range.
+        whole: Whether it must be a whole number.
 
     Raises:
-        ValueError: the message gives the setting, its value, and what is allowed.
+        ValueError: It is not; the message gives the setting, its value, and what is allowed.
     """
     is_whole = isinstance(value, Integral) or (isinstance(value, Real) and float(value).is_integer())
     if not is_number(value):
@@ -109,14 +108,14 @@ def check_setting(name: str, value: object, allowed: Range, whole: bool = False)
 
 
 def check_numbers(whole: Mapping[str, object], real: Mapping[str, object]) -> None:
-    """Refuse arguments that are no numbers.
+    """Check that arguments are numbers.
 
     Args:
-        whole: those that must be whole numbers, by name.
-        real: those that may be fractions, by name.
+        whole: Arguments that must be whole numbers, by name.
+        real: Arguments that may be fractions, by name.
 
     Raises:
-        ValueError: the message gives the argument and its value.
+        ValueError: One is not; the message gives the argument and its value.
     """
     for values, kind, words in ((whole, Integral, "a whole number"), (real, Real, "a number")):
         for name, value in values.items():
@@ -125,15 +124,15 @@ def check_numbers(whole: Mapping[str, object], real: Mapping[str, object]) -> No
 
 
 def check_three(name: str, values: object, allowed: Range) -> None:
-    """Refuse what is not three numbers in a range, one for each axis.
+    """Check that a setting is three numbers in a range, one for each axis.
 
     Args:
-        name: of the setting.
-        values: of it.
-        allowed: of each.
+        name: Name of the setting.
+        values: Value of the setting.
+        allowed: Allowed range of each number.
 
     Raises:
-        ValueError: the message gives the setting, its value, and what is allowed.
+        ValueError: It is not; the message gives the setting, its value, and what is allowed.
     """
     three = isinstance(values, Iterable) and not isinstance(values, str) and list(values)
     if not three or len(three) != 3 or not all(value in allowed for value in three):
@@ -141,15 +140,15 @@ def check_three(name: str, values: object, allowed: Range) -> None:
 
 
 def without_none(**arguments: object) -> dict[str, object]:
-    """Return the arguments that are given."""
+    """Return the arguments that are not None."""
     return {name: value for name, value in arguments.items() if value is not None}
 
 
 def given(value: T | None, field: str, needs_it: str) -> T:
-    """Return a setting that something needs.
+    """Return a required setting.
 
     Raises:
-        ValueError: it is missing; the message says of what.
+        ValueError: It is None; the message says what needs it.
     """
     if value is None:
         raise ValueError(f"{field} is not given: {needs_it} needs it.")
@@ -157,15 +156,15 @@ def given(value: T | None, field: str, needs_it: str) -> T:
 
 
 def shortened(text: str, length: int = 80) -> str:
-    """Return a text for a message, cut where it is longer than that."""
+    """Return a text for a message, cut to ``length`` characters."""
     return text if len(text) <= length else f"{text[:length]}…"
 
 
 def check_flags(**flags: object) -> None:
-    """Refuse what is neither True nor False: a word like "no" would count as yes.
+    """Check that arguments are True or False: a string like "no" would be truthy.
 
     Raises:
-        ValueError: the message names the argument and its value.
+        ValueError: One is not; the message gives the argument and its value.
     """
     for name, value in flags.items():
         if value is not True and value is not False:
@@ -173,30 +172,30 @@ def check_flags(**flags: object) -> None:
 
 
 def quoted(value: object) -> str:
-    """Return a value as a message quotes it."""
+    """Return the shortened ``repr`` of a value, for messages."""
     try:
         return shortened(repr(value))
-    except ValueError:  # Python writes no integer of more than 4,300 digits
+    except ValueError:  # Python converts no integer of more than 4,300 digits to text
         return "a number of thousands of digits"
 
 
 def suggestion(word: object, known: Collection[str]) -> str:
-    """Return ``" (did you mean x?)"`` for a likely slip of the pen, else nothing."""
+    """Return ``" (did you mean x?)"`` for a likely typing error, else an empty string."""
     close = difflib.get_close_matches(str(word), known, n=1)
     return f" (did you mean {close[0]}?)" if close else ""
 
 
 def import_own(name: str, asked: str) -> Any:
-    """Import what a user has written.
+    """Import a user's class or function.
 
-    The folder that a command is started from is looked in last, after all that Python looks in anyway.
+    The working directory is searched last, after the rest of ``sys.path``.
 
     Args:
         name: ``module:name``.
-        asked: How messages name it, for example ``reward=my_rewards:smooth``.
+        asked: Its name in messages, for example ``reward=my_rewards:smooth``.
 
     Raises:
-        ValueError: If it cannot be imported; the message says where it was looked for, and what to set.
+        ValueError: If it cannot be imported; the message says which folders were searched, and what to set.
     """
     module, _, attribute = name.partition(":")
     if not module or not attribute:

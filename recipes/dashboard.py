@@ -1,15 +1,15 @@
-"""A page of a flight: scrub it in 3-D, with the on-board image, the actor's action and the value beside it.
+"""Write a page on which to scrub through a flight in 3-D, with on-board image, action and value beside it.
 
     python recipes/dashboard.py agent=kidney
     python recipes/dashboard.py run=runs/dreamer_v3_kidney_20260101-120000
     python recipes/dashboard.py run=runs/kidney_x against=runs/kidney_y output=page.html
     python recipes/dashboard.py run=runs/kidney_x serve=8080
 
-Writes one HTML file that holds all it shows: open it in a browser, without a server, or send it to somebody. `run=` and
-`against=` take what flights were stored in: a run directory (its last evaluation), the folder of recipes/evaluate.py or
-recipes/fly.py, or a file *_trajectory.csv; or an agent that ships, by its name, which is flown once, deterministically.
-`agent=` flies checkpoints, too. `serve=` also shows it live, to browsers on this machine. Curves of training are
-TensorBoard's: the page says how to open it.
+Writes one self-contained HTML file: open it in a browser, without a server, or send it to somebody. `run=` and
+`against=` take a stored flight: a run directory (its last evaluation), an output folder of recipes/evaluate.py or
+recipes/fly.py, or a file *_trajectory.csv; or an included agent by its name, which is flown once, deterministically.
+`agent=` flies checkpoints, too. `serve=` also shows it live, to browsers on this machine. Training curves are in
+TensorBoard: the page says how to open it.
 """
 
 import shlex
@@ -38,23 +38,23 @@ from dreamer_racing.training.directory import RunDirectory
 
 PAGE = "dashboard.html"
 STORED = ("flight", "deterministic")
-"""Flights that recipes/fly.py and recipes/evaluate.py leave, by the beginnings of their files' names."""
+"""Prefixes of the files in which recipes/fly.py and recipes/evaluate.py store flights."""
 
 
 @dataclass
 class DashboardConfig:
-    """`recipes/dashboard.py`."""
+    """Configuration of `recipes/dashboard.py`."""
 
-    run: str | None = None  # run directory, folder or file of stored flights, or name of an agent that ships
-    agent: str | None = None  # instead: what to fly now, as of recipes/fly.py: an agent, a run directory, a checkpoint
-    against: str | None = None  # another flight on the same track, as run=, to be shown in the same scene
-    output: str | None = None  # file; null: dashboard.html in the run's folder, of an agent in runs/agent_<name>
-    serve: int | None = setting(None, Range(1, 65535))  # port, to show it live, too, on this machine alone
-    renderer: str = "auto"  # of flights that are flown now; as env.renderer in training, docs/options.md
-    seed: int = setting(0, SEED)  # likewise
+    run: str | None = None  # run directory, folder or file of stored flights, or name of an included agent
+    agent: str | None = None  # instead of run=: agent, run directory or checkpoint to fly now, as in recipes/fly.py
+    against: str | None = None  # another flight on the same track, given as run=, to show in the same scene
+    output: str | None = None  # file; null: dashboard.html in the run's folder, for an agent in runs/agent_<name>
+    serve: int | None = setting(None, Range(1, 65535))  # port on which to show it live, too, on this machine alone
+    renderer: str = "auto"  # for flights that are flown now; as env.renderer in training, docs/options.md
+    seed: int = setting(0, SEED)  # for flights that are flown now
 
     def check(self) -> None:
-        """Refuse what would leave open which flight is meant."""
+        """Refuse anything but one of run= and agent=, and an output that is not HTML."""
         if (self.run is None) == (self.agent is None):
             given = "neither is given" if self.run is None else f"both are given, {self.run} and {self.agent}"
             raise ValueError(f"run= names a stored flight, agent= what to fly now: give one of them; {given}.")
@@ -68,7 +68,7 @@ class Source(NamedTuple):
     flight: ShownFlight
     track: Track
     folder: Path
-    """Of the run, or of what else it was stored in."""
+    """Folder of the run, or else that of the stored flight."""
 
 
 @recipe("dashboard", DashboardConfig)
@@ -89,7 +89,7 @@ def main(config: DashboardConfig) -> None:
 
 
 def find(config: DashboardConfig) -> list[Source]:
-    """Find the flight asked for, and the one that it is to be compared with.
+    """Find or fly the requested flight, and the one to compare it with.
 
     Raises:
         ValueError: a file cannot be read, or the two flights are of different tracks.
@@ -110,7 +110,7 @@ def find(config: DashboardConfig) -> list[Source]:
 
 
 def locate(setting_name: str, place: str) -> Path | str:
-    """Find what `run=` and `against=` name: the file of a stored flight, or an agent that is to be flown.
+    """Return what `run=` or `against=` names: the file of a stored flight, or the name of an agent to fly.
 
     Raises:
         FileNotFoundError: there is nothing of that name, or no flight in it; the message says what would be right.
@@ -130,7 +130,7 @@ def locate(setting_name: str, place: str) -> Path | str:
 
 
 def stored_flights(folder: Path) -> list[Path]:
-    """List the flights of a run's evaluations, the last one last; or those that a recipe left in its own folder."""
+    """Return the files of a run's evaluation flights, the latest last; or those in a recipe's output folder."""
     if evaluated := evaluation_files(folder, NUMBERS):
         return evaluated
     places = (folder, RunDirectory(folder).evaluations)
@@ -138,7 +138,7 @@ def stored_flights(folder: Path) -> list[Path]:
 
 
 def read(file: Path) -> Source:
-    """Read a stored flight with its track; run and evaluation are its title."""
+    """Read a stored flight with its track; its title names run and evaluation."""
     trajectory, track = read_flight(file)
     folder = run_of(file)
     stage = "" if file.name == f"{STORED[0]}{NUMBERS}" else f", {stage_name(file)}"
@@ -158,8 +158,8 @@ def fly(place: str, config: DashboardConfig) -> Source:
 
 
 def how_it_trained(sources: list[Source]) -> str:
-    """Say how the curves of training are opened: they are TensorBoard's."""
-    # As seen from the working directory, if they lie there: pages are shown to others.
+    """Return a line on how to open the training curves in TensorBoard."""
+    # Relative to the working directory if possible, because pages are shown to others.
     logged = {Path(from_here(source.folder)): None for source in sources if (source.folder / "tensorboard").is_dir()}
     if not logged:
         return "Training curves: these flights lie in no run directory with TensorBoard files."

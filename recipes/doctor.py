@@ -1,4 +1,4 @@
-"""Says in a few seconds what this machine has for training, what is wrong with it, and how to mend that.
+"""Report in a few seconds what this machine has for training, what is wrong with it, and how to fix that.
 
     python recipes/doctor.py
     python recipes/doctor.py replay.capacity=1000000 checkpoint.keep=3    # would that fit?
@@ -19,31 +19,31 @@ from dreamer_racing.settings import COUNT, setting
 
 @dataclass
 class ReplaySize:
-    """As in `recipes/dreamer_v3.py`."""
+    """Replay setting, as in `recipes/dreamer_v3.py`."""
 
     capacity: int = setting(250_000, COUNT)  # records
 
 
 @dataclass
 class CheckpointNumber:
-    """As in `recipes/dreamer_v3.py`."""
+    """Checkpoint setting, as in `recipes/dreamer_v3.py`."""
 
     keep: int = setting(2, COUNT)
 
 
 @dataclass
 class DoctorConfig:
-    """`recipes/doctor.py`."""
+    """Configuration of `recipes/doctor.py`."""
 
     replay: ReplaySize = field(default_factory=ReplaySize)
     checkpoint: CheckpointNumber = field(default_factory=CheckpointNumber)
-    run_dir: str = "runs"  # where runs are to go
-    json: bool = False  # for programs, on stdout; --json does the same
+    run_dir: str = "runs"  # folder for runs
+    json: bool = False  # print JSON on stdout, for programs; --json does the same
 
 
 @recipe("doctor", DoctorConfig, logs=False)
 def main(config: DoctorConfig) -> None:
-    """Examine, and print what was found."""
+    """Examine the machine, and print the findings."""
     findings = []
     for finding in examine(config.replay.capacity, config.checkpoint.keep, Path(config.run_dir)):
         findings.append(finding)
@@ -56,7 +56,7 @@ def main(config: DoctorConfig) -> None:
 
 
 def line(finding: Diagnosis) -> str:
-    """Say a finding in a line, and its remedy in another."""
+    """Return a finding as a line, and its remedy as another."""
     remedy = f"\n{'':25}→ {finding.remedy}" if finding.remedy else ""
     return f"{finding.what:<14} {finding.state.value:<9} {finding.found}{remedy}"
 

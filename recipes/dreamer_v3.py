@@ -34,7 +34,7 @@ def main(config: DictConfig) -> None:
 
 def train(config: DreamerV3RunConfig, session: Session) -> None:
     """Collect, replay, update, evaluate, save."""
-    own = share_of(config)  # of several processes
+    own = share_of(config)  # of this process
     env = make_own_env(own)
     learner = cast(DreamerV3, building.make_learner(own, Interface.of(env), own.device, config.seed))
     if config.init_from and not config.resume:
@@ -60,20 +60,20 @@ def train(config: DreamerV3RunConfig, session: Session) -> None:
     )
 
     for rollout in session.rollouts():
-        # Replay what was collected; a resumed run first makes the updates that are due, from what it has.
+        # Add the rollout to the replay; a resumed run first makes the updates that are due.
         if rollout is not None:
             replay.extend(rollout)
             episodes = session.log_episodes(rollout)
             session.log(curriculum.adapt(episodes))
             session.log(schedule.observe(episodes, session.env_steps))
 
-        # Move what is scheduled by the length of the run, or by the gates that are passed.
+        # Apply the schedules, which go by the run's length or by the gates passed.
         scheduled = schedule.at(session.env_steps)
         if "start_on_line" in scheduled:
             cast(DroneRacingEnv, env).worlds.start_on_line = scheduled.pop("start_on_line")
         learner.adjust(**scheduled)
 
-        # Update world model, actor and critic on replayed windows, which later ones go on from.
+        # Update world model, actor and critic on replayed windows; later windows begin with the latents stored here.
         for _ in session.updates(ratio.updates_due(session.env_steps, learner.updates)):
             with session.timed("sample"):
                 batch = replay.sample()

@@ -5,7 +5,7 @@
     python recipes/evaluate.py checkpoint=agents/kidney
 
 Flies the deterministic and the stochastic policy from the start pose for the track's laps, prints both, and writes
-evaluation.json beside plots, videos and the episodes' own numbers. protocol=full does it under every condition of
+evaluation.json beside plots, videos and the numbers of each episode. protocol=full does it under every condition of
 docs/evaluation.md, with both presets of physics, and adds evaluation.md. An earlier evaluation is never overwritten.
 """
 
@@ -44,17 +44,17 @@ PROTOCOLS = ("nominal", "full")
 
 @dataclass
 class EvaluateConfig(FlightConfig):
-    """`recipes/evaluate.py`."""
+    """Configuration of `recipes/evaluate.py`."""
 
     protocol: str = "nominal"  # nominal | full: every condition of docs/evaluation.md, with both presets
-    # with protocol=nominal: of starts, as a multiple of the noise of training
+    # with protocol=nominal: noise of starts, as a multiple of the noise of training
     start_noise: float = setting(0.0, NOT_NEGATIVE)
     run_dir: str | None = None  # null: <run of the checkpoint>/evaluation
     video_steps: int = setting(500, COUNT)
-    seed: int = setting(1, SEED)  # of starts and drones: others than those of evaluations in training, whose seed is 0
+    seed: int = setting(1, SEED)  # of starts and drones; evaluations in training use 0
 
     def check(self) -> None:
-        """Refuse what is no protocol, or would be ignored."""
+        """Refuse an unknown protocol, and noise that would be ignored."""
         if self.protocol not in PROTOCOLS:
             raise ValueError(f"protocol={self.protocol}: there are {', '.join(PROTOCOLS)}.")
         if self.protocol == "full" and self.start_noise:
@@ -87,7 +87,7 @@ def main(config: EvaluateConfig) -> None:
 
 
 def refuse_races(config: EvaluateConfig, track: Track) -> None:
-    """Refuse races that a track leaves no room for."""
+    """Refuse conditions or start noise that the track leaves no room for."""
     if config.protocol == "full":
         check_conditions(CONDITIONS, track, config.seed)
     else:
@@ -95,7 +95,7 @@ def refuse_races(config: EvaluateConfig, track: Track) -> None:
 
 
 def make_nominal_report(config: EvaluateConfig, restored: Restored, directory: Path) -> EvaluationReport:
-    """Make the races that the policy is to fly as it was trained to."""
+    """Make the evaluation in the race that the policy was restored for."""
     report = make_evaluator(
         restored.trained,
         directory,
@@ -110,7 +110,7 @@ def make_nominal_report(config: EvaluateConfig, restored: Restored, directory: P
 
 
 def evaluate_nominal(report: EvaluationReport) -> dict[str, Any]:
-    """Fly the policy both ways; return what evaluation.json says of each."""
+    """Fly the policy deterministically and stochastically; return the statistics of each for evaluation.json."""
     written: dict[str, Any] = {}
     for name in MODES:
         result = report.evaluate(deterministic=name == "deterministic")
@@ -140,7 +140,7 @@ def evaluate_fully(config: EvaluateConfig, restored: Restored, directory: Path) 
 
 
 def write_flight(directory: Path, result: Result, video_steps: int) -> None:
-    """Draw the first flight of a condition from above; film it, if the agent sees and acts without noise."""
+    """Plot the first flight of a condition from above; film it, if it has images and the policy is deterministic."""
     trajectory = result.evaluation.trajectories[0]
     plot_top_down(result.track, trajectory, RunDirectory(directory).plots / f"{result.name}.png")
     if trajectory.pixels is not None and result.mode == "deterministic":
@@ -150,7 +150,7 @@ def write_flight(directory: Path, result: Result, video_steps: int) -> None:
 
 
 def describe(results: list[Result], preset: str) -> dict[str, Any]:
-    """Return what evaluation.json says: the nominal race as with protocol=nominal, and a record of each condition."""
+    """Return the contents of evaluation.json: the nominal race as with protocol=nominal, and all conditions."""
     nominal = {r.mode: r.evaluation.to_dict() for r in results if r.preset == preset and r.condition == "nominal"}
     return {**nominal, "conditions": [result.to_dict() for result in results]}
 

@@ -1,4 +1,4 @@
-"""Many runs: algorithms × tracks × variants × seeds, one process each; what is finished is not run again.
+"""Make many runs: algorithms × tracks × variants × seeds, one process each; finished runs are not repeated.
 
     python recipes/experiment.py --multirun budget=smoke
     python recipes/experiment.py --multirun budget=paper hydra/launcher=slurm
@@ -36,30 +36,30 @@ from dreamer_racing.training.directory import RunDirectory, latest_checkpoint
 FOLDER = Path(__file__).resolve().parent
 LOG = "log.txt"
 SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGUSR1, signal.SIGUSR2)
-OWN = ("name", "algorithm", "variant", "variants", "overrides", "directory")  # settings that no recipe has
+OWN = ("name", "algorithm", "variant", "variants", "overrides", "directory")  # not for recipes
 
-# Launchers send configurations to processes of theirs, which must find the modules of this folder.
+# Launchers start processes that must find the modules of this folder.
 os.environ["PYTHONPATH"] = os.pathsep.join(filter(None, [str(FOLDER), os.environ.get("PYTHONPATH")]))
 
 
 @dataclass
 class ExperimentConfig(RunConfig):
-    """`recipes/experiment.py`: one run of an experiment; hydra's multirun makes all of them.
+    """Configuration of `recipes/experiment.py`: one run of an experiment; hydra's multirun makes all of them.
 
-    What all recipes have in common is set as with them: `track=`, `seed=`, `budget=`, `env.from_pixels=` ...
+    Settings that all recipes share are given as to a recipe: `track=`, `seed=`, `budget=`, `env.from_pixels=` ...
     """
 
     name: str = MISSING  # of the experiment
-    algorithm: str = "dreamer_v3"  # of a training recipe: its file's name
-    variant: str = "default"  # one of the following
-    variants: dict[str, list[str]] = field(default_factory=dict)  # overrides of the algorithm's recipe by name
+    algorithm: str = "dreamer_v3"  # name of a training recipe's file
+    variant: str = "default"  # name of one of `variants`
+    variants: dict[str, list[str]] = field(default_factory=dict)  # overrides of the recipe, by variant
     overrides: list[str] = field(default_factory=list)  # of every run, e.g. "overrides=['loss.entropy_scale=1e-4']"
     directory: str = "runs"
 
 
 @recipe("experiment", ExperimentConfig, composed=True)
 def main(settings: ExperimentConfig) -> None:
-    """Run one of the experiment's runs, or what is left of it; what fails is noted, so that the others are made."""
+    """Start or resume one run of the experiment; a failure is noted in a file, and the other runs are still made."""
     run_dir = directory_of(settings)
     note = run_dir.parent / FAILURES / f"{run_dir.name}.txt"
     note.unlink(missing_ok=True)
@@ -76,20 +76,20 @@ def main(settings: ExperimentConfig) -> None:
 
 
 def check(config: ExperimentConfig) -> None:
-    """Refuse an algorithm or a variant that there is not."""
+    """Refuse an unknown algorithm or variant."""
     for name, known in (("algorithm", tuple(RECIPES)), ("variant", tuple(config.variants))):
         if (value := getattr(config, name)) not in known:
             raise ValueError(f"{name}={value}: there are {', '.join(known)}.")
 
 
 def directory_of(config: ExperimentConfig) -> Path:
-    """The directory of one run."""
+    """Return the directory of one run."""
     name = f"{config.algorithm}_{Path(config.track).stem}_{config.variant}_seed{config.seed}"
     return Path(config.directory).absolute() / config.name / name
 
 
 def bring_to_its_end(config: ExperimentConfig, run_dir: Path, given: list[str]) -> None:
-    """Start, resume or skip a run, and say which.
+    """Start, resume or skip a run, and print which.
 
     Raises:
         ValueError: the run is refused.
@@ -99,7 +99,7 @@ def bring_to_its_end(config: ExperimentConfig, run_dir: Path, given: list[str]) 
     if command is None:
         print(f"{run_dir}: finished, skipped", flush=True)
         return
-    RunDirectory(run_dir).claim().release()  # refuses here, rather than into the log of a live run
+    RunDirectory(run_dir).claim().release()  # refuses a live run here, rather than in its log
     began = "resumed" if any("resume=" in word for word in command) else "started"
     print(f"{run_dir}: {began}, budget={config.budget}", flush=True)
     if status := run(command, run_dir):
@@ -110,11 +110,11 @@ def bring_to_its_end(config: ExperimentConfig, run_dir: Path, given: list[str]) 
 
 
 def next_command(config: ExperimentConfig, given: list[str]) -> list[str] | None:
-    """The command that brings a run to its end; None if it is there.
+    """Return the command that completes a run; None if it is complete.
 
     Args:
         config: of the run.
-        given: overrides of the experiment, those that are not its own for the recipe.
+        given: overrides of the experiment; all but its own settings go to the recipe.
 
     Raises:
         ValueError: the algorithm or the variant is unknown, or the directory holds a run with other settings.
@@ -140,7 +140,7 @@ def next_command(config: ExperimentConfig, given: list[str]) -> list[str] | None
 
 
 def tuned_by_recipe(run_dir: Path, overrides: list[str]) -> str | None:
-    """The override that a run's recipe chose for tuned=auto, which brings a length of its own."""
+    """Return the override that the run's recipe chose for tuned=auto, because it changes the run's length."""
     if "tuned" in settings_of(overrides):
         return None
     saved = settings_of(read_yaml(RunDirectory(run_dir).overrides, ListConfig))
@@ -148,7 +148,7 @@ def tuned_by_recipe(run_dir: Path, overrides: list[str]) -> str | None:
 
 
 def refuse_other_settings(run_dir: Path, overrides: list[str]) -> None:
-    """Refuse to continue a run that was started with other overrides, but for its length."""
+    """Refuse to resume a run that was started with other overrides, except for its length."""
     saved, wanted = settings_of(read_yaml(RunDirectory(run_dir).overrides, ListConfig)), settings_of(overrides)
     saved = {name: value for name, value in saved.items() if name != "tuned" or name in wanted}  # chosen by tuned=auto
     differing = [name for name in sorted(saved.keys() | wanted.keys()) if saved.get(name) != wanted.get(name)]
@@ -163,10 +163,10 @@ def refuse_other_settings(run_dir: Path, overrides: list[str]) -> None:
 
 
 def settings_of(overrides: Iterable[str]) -> dict[str, Any]:
-    """Overrides by name, their values as YAML understands them; without those that do not change what a run is.
+    """Return the values of overrides by name, parsed as YAML, without those that may differ when a run is resumed.
 
     Raises:
-        ValueError: a value is no YAML.
+        ValueError: a value is not valid YAML.
     """
     values = {}
     for override in map(str, overrides):
@@ -180,18 +180,18 @@ def settings_of(overrides: Iterable[str]) -> dict[str, Any]:
 
 
 def run(command: list[str], run_dir: Path) -> int:
-    """Run a recipe in a process of its own, its output in a file; return its exit status.
+    """Run a recipe in a process of its own, with its output in a file; return its exit status.
 
-    Signals reach it as one SIGTERM, so that it saves and ends. Then this process ends too, or does what it would have
-    done at once: that of a Slurm job puts itself into the queue again.
+    Signals are passed on as SIGTERM, so that the recipe saves and ends. Then this process ends too, or calls the
+    handler that the signal had before: that of a Slurm job queues the job again.
     """
     received: list[signal.Signals] = []
-    here = threading.current_thread()  # signals are the main thread's
+    here = threading.current_thread()  # only the main thread may set handlers
     before = {number: signal.getsignal(number) for number in SIGNALS} if here is threading.main_thread() else {}
     if before.get(signal.SIGHUP) is signal.SIG_IGN:  # nohup
         del before[signal.SIGHUP]
     for number in before.keys() & {signal.SIGUSR1, signal.SIGUSR2}:
-        signal.signal(number, signal.SIG_IGN)  # inherited by the recipe, for Slurm sends them to every process
+        signal.signal(number, signal.SIG_IGN)  # inherited by the recipe, since Slurm signals every process
     log = (run_dir / LOG).open("a", encoding="utf-8")
     with log, subprocess.Popen(command, stdout=log, stderr=log, start_new_session=True) as process:
 

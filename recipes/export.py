@@ -3,11 +3,11 @@
     python recipes/export.py checkpoint=runs/dreamer_v3_kidney_20260101-120000 output=exports/kidney/actor.onnx
     python recipes/export.py checkpoint=runs/dreamer_v3_kidney_20260101-120000 agent=agents/kidney
 
-Flies the policy on the track that it was trained on, replays that flight through every copy, and writes them only if
-they do the same; then measures how long a step takes. What flies them is dreamer_racing/export/onnx_actor.py.
+Records a flight on the track that the policy was trained on, replays it through every exported copy, and writes them
+only if their actions agree; then measures how long a step takes. dreamer_racing/export/onnx_actor.py runs them.
 
 With agent= the folder gets everything that other recipes need to fly the agent too, see docs/agents.md: an evaluation
-of just these weights must have been made before.
+of exactly these weights must have been made before.
 """
 
 import json
@@ -58,24 +58,24 @@ from dreamer_racing.modules import Interface
 from dreamer_racing.settings import COUNT, SEED, setting
 from dreamer_racing.training.directory import RunDirectory
 
-BY_ITEM = ("episodes", "crashes_by_gate")  # numbers of an evaluation that agent.json does without
-OF_A_MACHINE = ("run_dir", "resume", "device", "env.device")  # settings that say nothing of what was learned
+BY_ITEM = ("episodes", "crashes_by_gate")  # entries of an evaluation that agent.json leaves out
+OF_A_MACHINE = ("run_dir", "resume", "device", "env.device")  # settings that do not affect what is learned
 
 
 @dataclass
 class ExportConfig:
-    """`recipes/export.py`."""
+    """Configuration of `recipes/export.py`."""
 
     checkpoint: str = MISSING  # run directory, checkpoint, or agent (docs/agents.md)
-    weights: str = "auto"  # auto | averaged | trained: which to export; auto takes the averaged where they are kept
+    weights: str = "auto"  # auto | averaged | trained: which to export; auto takes the averaged ones if there are any
     output: str | None = None  # .onnx file, in a folder of its own; null: <run of the checkpoint>/export/actor.onnx
-    agent: str | None = None  # folder of an agent that is to ship, instead of output, e.g. agents/kidney
-    evaluation: str | None = None  # with agent=: its numbers; null: the run's latest of these weights
-    commit: str | None = None  # with agent=: that it was trained at; null: the one that the run noted
+    agent: str | None = None  # folder for a complete agent, instead of output, e.g. agents/kidney
+    evaluation: str | None = None  # with agent=: evaluation.json to include; null: the run's latest of these weights
+    commit: str | None = None  # with agent=: git commit of the training; null: the one that the run noted
     latent: str = "mode"  # mode (argmax of the posterior) | sample (takes noise)
-    # write the step in two parts, too: what needs no image can then be done before it (docs/export.md)
+    # also write the step in two parts, so that the one without images can run before the image (docs/export.md)
     parts: bool = False
-    steps: int = setting(200, COUNT)  # of a recorded flight, over which the export must fly as the original does
+    steps: int = setting(200, COUNT)  # control steps of a recorded flight, on which the export must act as the original
     renderer: str = "auto"
     seed: int = setting(0, SEED)
 
@@ -83,8 +83,8 @@ class ExportConfig:
 @recipe("export", ExportConfig)
 def main(config: ExportConfig) -> None:
     """Restore the policy, fly it, export it, compare, measure."""
-    # Its exporter says four times that torchvision is not installed, which nothing here needs, and warns of a class of
-    # its own that it copies.
+    # torch's exporter reports four times that torchvision is not installed, which is not needed, and warns of copying a
+    # class of its own.
     logging.getLogger("torch.onnx").setLevel(logging.ERROR)
     warnings.filterwarnings("ignore", r"`isinstance\(treespec, LeafSpec\)` is deprecated", FutureWarning, r"copyreg$")
     set_num_threads(1)
@@ -97,7 +97,7 @@ def main(config: ExportConfig) -> None:
 
 
 def export(config: ExportConfig) -> None:
-    """Do all of it, and print what came of it."""
+    """Export the actor and print the results."""
     if config.latent not in LATENTS:
         raise ValueError(f"latent={config.latent}: there are {' and '.join(LATENTS)}.")
     checkpoint = find_trained(config.checkpoint)
@@ -106,7 +106,7 @@ def export(config: ExportConfig) -> None:
         raise ValueError(f"{checkpoint} was trained by {trained.algorithm}; this recipe exports actors of dreamer_v3.")
     if not is_race(trained):
         raise ValueError(f"{checkpoint} was trained on {trained.task}; this recipe exports actors that race.")
-    if trained.track_description is None:  # also of a run that was begun before they were noted
+    if trained.track_description is None:  # also for runs from before it was noted
         trained.track_description = describe_file(trained.track)
     if trained.env.vector is not None:
         raise ValueError(
@@ -136,7 +136,7 @@ def export(config: ExportConfig) -> None:
 def prepare(
     config: ExportConfig, trained: WorldModelRunConfig, checkpoint: Path
 ) -> tuple[ActorStep, dict[str, Any], RecordedFlight]:
-    """Restore the policy, fly it, and describe the step that is to be exported."""
+    """Restore the policy and fly it; return the step to export, its contract and the flight."""
     env = DroneRacingEnv(
         num_envs=1,
         seed=config.seed,
@@ -174,13 +174,13 @@ def prepare(
 
 
 def name_of(track: Track, given: str) -> str:
-    """Return a track's name: of a built-in one that is the same, decoys and all, or of its file, without folders."""
+    """Return the name of the built-in track that is the same, with its decoys, or else the track's file name."""
     same = track.name in BUILTIN_TRACKS and hash_track(load_track(track.name)) == hash_track(track)
     return track.name if same else Path(given).name
 
 
 def check_agent(config: ExportConfig, checkpoint: Path) -> None:
-    """Refuse settings that go with no agent, or of which one would be ignored."""
+    """Refuse settings that need agent= or conflict with it."""
     if not config.agent:
         if given := [name for name in ("evaluation", "commit") if getattr(config, name) is not None]:
             raise ValueError(f"{given[0]}={getattr(config, given[0])} is for agent=FOLDER: leave it out.")
@@ -196,7 +196,7 @@ def check_agent(config: ExportConfig, checkpoint: Path) -> None:
 def describe(
     config: ExportConfig, trained: WorldModelRunConfig, checkpoint: Path, step: ActorStep, contract: dict[str, Any]
 ) -> dict[str, Any]:
-    """Return what agent.json says: where the agent comes from, and how well it flies."""
+    """Return the contents of agent.json: where the agent comes from, and how well it flies."""
     source = contract["source"]
     history = history_of(checkpoint, source["env_steps"])
     commit = config.commit or (history[-1]["commit"] if history else None)
@@ -204,7 +204,7 @@ def describe(
         print("commit of the training: not noted, for neither the run nor commit= says it")
     trains = f"python recipes/{trained.algorithm}.py {shlex.join(history[-1]['overrides'])}" if history else None
     training = {"command": trains, "commit": commit, "seed": trained.seed}
-    if len(history) > 1:  # begun or continued with other settings, perhaps
+    if len(history) > 1:  # resumed, perhaps with other settings
         training["starts"] = history
     return {
         "algorithm": trained.algorithm,
@@ -220,7 +220,7 @@ def describe(
 
 
 def history_of(checkpoint: Path, env_steps: int) -> list[dict[str, Any]]:
-    """Return a run's starts before a checkpoint of so many env_steps, overrides without what is of one machine."""
+    """Return a run's starts before a checkpoint at `env_steps`, without overrides that are specific to a machine."""
     return [
         start | {"overrides": without_machine(start["overrides"])}
         for start in RunDirectory(config_folder(checkpoint)).run.read_starts()
@@ -229,7 +229,7 @@ def history_of(checkpoint: Path, env_steps: int) -> list[dict[str, Any]]:
 
 
 def without_machine(overrides: Iterable[str]) -> list[str]:
-    """Return overrides without what is of one machine, the folders of a track's file among it."""
+    """Return overrides without those that are specific to a machine, and of a track's file only the name."""
     kept = [text for text in overrides if override_key(text) not in OF_A_MACHINE]
     files = {text: Path(str(override_value(text))).name for text in kept if override_key(text) == "track"}
     return [as_override("track", files[text]) if text in files else text for text in kept]
@@ -267,7 +267,7 @@ def read_evaluation(
 
 
 def newest_evaluation(folder: Path, weights_sha256: str, track_sha256: str) -> Path:
-    """Return the latest of a run's evaluations of these weights on this track; if none is, one that is to be refused.
+    """Return a run's latest evaluation of these weights on this track; without one, a file that the caller refuses.
 
     Each evaluation has a folder of its own.
     """
@@ -280,21 +280,21 @@ def newest_evaluation(folder: Path, weights_sha256: str, track_sha256: str) -> P
 
 
 def write_agent(folder: Path, trained: WorldModelRunConfig, about: dict[str, Any]) -> None:
-    """Write configuration and agent.json, the latter last: with it the folder is an agent."""
+    """Write the configuration, and last agent.json, which makes the folder an agent."""
     (folder / AGENT).unlink(missing_ok=True)
     if trained.env.reward is not None:
         print(f"reward: the agent ships without env.reward={trained.env.reward}; wherever it flies, Eq. 1 is paid")
     env, track = (
         replace(trained.env, device="cpu", reward=None),
         Path(trained.track).name,
-    )  # a file's place is of this machine
+    )  # without folders of this machine
     ships = replace(trained, track=track, run_dir=None, resume=None, device="auto", env=env)
     OmegaConf.save(OmegaConf.structured(ships), folder / CONFIG)
     (folder / AGENT).write_text(json.dumps(about, indent=2, allow_nan=False) + "\n", encoding="utf-8")
 
 
 def measure(step: ActorStep, flight: RecordedFlight, output: Path, parts: bool) -> None:
-    """Print how long one step takes, with one thread."""
+    """Print how long one step takes with one thread."""
     contract = read_contract(output.parent / CONTRACT)
     actors = {"onnxruntime": OnnxActor(output, whole=True), "torch": TorchActor(contract, step)}
     felt = {} if flight.imu is None else {"imu": flight.imu[0]}

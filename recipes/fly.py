@@ -6,9 +6,9 @@
     python recipes/fly.py agent=kidney viewer=true
     python recipes/fly.py track=figure8 pilot=keyboard
 
-A scripted pilot sees the true state, not images: it shows what a track asks for, and what lap times are in reach. An
-agent has learned to fly by what its camera sees: give one that ships by its name (docs/agents.md), or a path.
-`pilot=keyboard` and `pilot=gamepad` are you, by what the camera sees in a window (arrows: roll and pitch; A, D: yaw;
+A scripted pilot sees the true state, not images: it shows what a track demands, and which lap times are possible. An
+agent has learned to fly by its camera's images: give an included one by its name (docs/agents.md), or a path. With
+`pilot=keyboard` and `pilot=gamepad` you fly, by the camera's images in a window (arrows: roll and pitch; A, D: yaw;
 W, S: throttle). `viewer=true` shows agents and scripted pilots live in MuJoCo's viewer, the camera's image in a corner,
 and writes nothing. Windows need a display. `view=chase` needs none: it films the drone from behind.
 """
@@ -22,7 +22,7 @@ from itertools import count
 from pathlib import Path
 from typing import Any
 
-import composing  # noqa: F401 - first: says how to run this where packages are missing
+import composing  # noqa: F401 - first: explains how to run this if packages are missing
 import numpy as np
 from composing.building import worlds_of
 from composing.entry import plain_errors, recipe
@@ -52,8 +52,8 @@ from dreamer_racing.training.directory import EVALUATION
 
 GIF_SIZE = 256  # pixels, least side of either picture
 GIF_STRIDE = 2  # control steps a frame: 25 frames a second
-CHASE_STRIDE, CHASE_COLORS = 3, 32  # of the GIF from outside, in which everything moves
-PILOT, TRACK, PRESET = "scripted", "kidney", "easy"  # without an agent
+CHASE_STRIDE, CHASE_COLORS = 3, 32  # of chase.gif, in which the whole picture moves
+PILOT, TRACK, PRESET = "scripted", "kidney", "easy"  # defaults without an agent
 VIEWS = ("map", "chase")
 GIF_STEPS = 300  # control steps shown if there is no second lap
 BREAK = 1.0  # s between two flights in the viewer
@@ -63,14 +63,14 @@ Acting = Callable[[TensorDictBase], TensorDictBase]
 
 @dataclass
 class FlyConfig:
-    """`recipes/fly.py`."""
+    """Configuration of `recipes/fly.py`."""
 
     agent: str | None = None  # name of one in agents/, or path to an agent, a run directory or a checkpoint
     pilot: str | None = None  # scripted | hover | keyboard | gamepad; null: scripted, if there is no agent
     track: str | None = None  # built-in track, or path to a YAML file; null: kidney, or what the agent was trained on
     preset: str | None = None  # physics: easy | faithful | betaflight; null: easy, or what the agent was trained on
     run_dir: str = "runs/fly"
-    # pixels, side of the nose camera's image; null: 64, or the agent's, as the next two
+    # pixels, side of the on-board image; null: 64, or the agent's own, as with the next two
     image_size: int | None = setting(None, COUNT)
     camera_tilt: float | None = None  # degrees upwards; null: 25
     control_rate: float | None = setting(None, COUNT)  # Hz; null: 50
@@ -120,7 +120,7 @@ PILOTS: dict[str, Callable[[Track, QuadrotorParameters], Acting]] = {"scripted":
 @recipe("fly", FlyConfig)
 def main(config: FlyConfig) -> None:
     """Fly or watch."""
-    set_num_threads(1)  # a single drone: further threads would wait, and keep cores busy with it
+    set_num_threads(1)  # with a single drone, more threads would only keep cores busy waiting
     if config.viewer:
         watch(config)
     else:
@@ -128,7 +128,7 @@ def main(config: FlyConfig) -> None:
 
 
 def check_display(config: FlyConfig) -> None:
-    """Refuse to be watched where there is no window, and say how to see the flight all the same.
+    """Refuse viewer=true if no window can be opened, and name the alternative.
 
     Raises:
         ValueError: no window can be opened here.
@@ -150,12 +150,12 @@ class PlannedFlight:
 
 
 def make_flight(config: FlyConfig) -> PlannedFlight:
-    """Put together who flies, and where."""
+    """Prepare the flight of a pilot or an agent."""
     return pilots_flight(config) if config.agent is None else agents_flight(config)
 
 
 def fly(config: FlyConfig) -> None:
-    """Fly one episode of all laps and write what there is to see."""
+    """Fly one episode of all laps, and write its numbers, plot and films."""
     with folder_to_fill(Path(config.run_dir)) as directory:
         flight = make_flight(config)
         outside = open_view(flight.env) if config.view == "chase" else None
@@ -170,7 +170,7 @@ def fly(config: FlyConfig) -> None:
 
 @contextmanager
 def folder_to_fill(directory: Path) -> Iterator[Path]:
-    """Make a folder before the flight, which would be in vain without; if nothing is written to it, it goes again."""
+    """Make a folder, so that failing to fails before the flight; remove it at the end if nothing was written to it."""
     made = [folder for folder in (directory, *directory.parents) if not folder.exists()]
     with plain_errors():
         directory.mkdir(parents=True, exist_ok=True)
@@ -178,12 +178,12 @@ def folder_to_fill(directory: Path) -> Iterator[Path]:
         yield directory
     finally:
         for folder in made:
-            with suppress(OSError):  # it holds something
+            with suppress(OSError):  # it is not empty
                 folder.rmdir()
 
 
 def watch(config: FlyConfig) -> None:
-    """Fly one episode of all laps after the other before someone's eyes, until the window is closed."""
+    """Show one episode of all laps after the other in a window, until it is closed."""
     flight = make_flight(config)
     window = RaceWindow(flight.env.worlds)
     print("close the window, or press Ctrl-C, to end")
@@ -198,13 +198,13 @@ def watch(config: FlyConfig) -> None:
 
 
 def in_words(episode: Episode) -> str:
-    """Say how a flight ended, and what its laps took."""
+    """Return how a flight ended, and its lap times, in words."""
     laps = ", ".join(f"{duration:.2f} s" for duration in episode.lap_times)
     return f"{episode.outcome.replace('_', ' ')} after {episode.gates_passed} gates, laps: {laps or 'none'}"
 
 
 def pilots_flight(config: FlyConfig) -> PlannedFlight:
-    """Let a pilot fly by the true state, or somebody by hand."""
+    """Prepare a flight by a pilot that sees the true state, or by hand."""
     pilot, preset = config.pilot or PILOT, config.preset or PRESET
     camera = Camera()
     if config.image_size is not None:
@@ -224,7 +224,7 @@ def pilots_flight(config: FlyConfig) -> PlannedFlight:
 
 
 def fly_by_hand(kind: str, env: DroneRacingEnv) -> Evaluation:
-    """Let the one at this machine fly, in a window; nothing is written of a flight that is abandoned."""
+    """Let the user fly in a window; exit without writing anything if the flight is abandoned."""
     parameters = env.worlds.parameters
     with plain_errors():
         sticks = PygameSticks(kind, parameters.control_dt)
@@ -238,7 +238,7 @@ def fly_by_hand(kind: str, env: DroneRacingEnv) -> Evaluation:
 
 
 def agents_flight(config: FlyConfig) -> PlannedFlight:
-    """Let the deterministic policy of a trained agent fly."""
+    """Prepare a flight by the deterministic policy of a trained agent."""
     with plain_errors():
         race = FlightConfig(track=config.track, preset=config.preset, renderer=config.renderer, seed=config.seed)
         restored = restore(replace(race, checkpoint=str(config.agent)))
@@ -256,13 +256,13 @@ def agents_flight(config: FlyConfig) -> PlannedFlight:
 
 
 def write(directory: Path, track: Track, result: Evaluation) -> None:
-    """Write numbers, plot and, of flights with images, video and GIF, and say where."""
+    """Write numbers and plot, and of flights with images a video and a GIF; print where."""
     trajectory = result.trajectories[0]
     (directory / EVALUATION).write_text(result.to_json())
     stored = write_flight(directory / "flight", trajectory, track)
     plot_top_down(track, trajectory, directory / "top_down.png")
     for earlier in ("onboard.mp4", "onboard.gif", "chase.mp4", "chase.gif"):
-        (directory / earlier).unlink(missing_ok=True)  # that it is not taken for this flight's
+        (directory / earlier).unlink(missing_ok=True)  # so that none is mistaken for this flight's
     files = f"{directory}: {EVALUATION}, {', '.join(stored)}, top_down.png"
     if trajectory.pixels is None:
         print(f"{'files':<18} {files} (there is no video: the agent sees numbers)")
@@ -278,7 +278,7 @@ def write(directory: Path, track: Track, result: Evaluation) -> None:
 
 
 def open_view(env: DroneRacingEnv) -> ChaseView:
-    """Make what films the drone, before the flight: where there is no OpenGL, that would be in vain."""
+    """Make the chase view, so that missing OpenGL fails before the flight."""
     with plain_errors():
         return ChaseView(env.track, env.worlds.parameters, size=GIF_SIZE)
 
@@ -296,7 +296,7 @@ def film_from_outside(directory: Path, view: ChaseView, track: Track, trajectory
 
 
 def second_lap(trajectory: Trajectory) -> tuple[int, int]:
-    """Find the ends of the second lap, which is flown at racing speed; of the beginning of the flight without one."""
+    """Return the first and last step of the second lap, flown at racing speed; else of the flight's beginning."""
     ends = (np.diff(laps_completed(trajectory)).nonzero()[0] + 1).tolist()
     return (ends[0], ends[1]) if len(ends) > 1 else (0, min(GIF_STEPS, len(trajectory.action)))
 

@@ -58,12 +58,12 @@ from dreamer_racing.hil.view import LiveView
 
 STATISTICS = "statistics.json"
 plainly = partial(plain_errors, also=(ImportError,))
-"""Errors in words, of links and poses whose packages, extras, are missing, too."""
+"""As `plain_errors`, also for links and pose sources whose optional packages are missing."""
 
 
 @recipe("hil", HilConfig)
 def main(config: HilConfig) -> None:
-    """Fly, or look at a flight."""
+    """Fly, or replay or report a recorded flight."""
     with plainly():
         check(config)
         if config.actor is None:
@@ -72,15 +72,15 @@ def main(config: HilConfig) -> None:
 
 
 def make_flyer(config: HilConfig, track: Track | None = None) -> tuple[Flyer, dict[str, Any]]:
-    """Make who flies, and return its contract: of a pilot, what such an actor's would say of its commands.
+    """Make the flyer, and return it with its contract, which for a pilot describes its commands.
 
     Args:
-        config: Says who.
-        track: That a pilot is to fly; None: the one of its name.
+        config: Names the flyer.
+        track: Track for a pilot; None: the one that the configuration names.
     """
     assert config.actor is not None, "checked"
     if config.actor == PILOT:
-        from dreamer_racing.plant.pilot import PilotFlyer  # needs torch, which actors do without
+        from dreamer_racing.plant.pilot import PilotFlyer  # needs torch, unlike actors
 
         if config.track is None:
             raise ValueError("track= is missing: actor=pilot has none of its own.")
@@ -97,11 +97,11 @@ def make_flyer(config: HilConfig, track: Track | None = None) -> tuple[Flyer, di
 
 
 def fly(config: HilConfig) -> int:
-    """Fly one flight; return the exit status: 0 if it was flown to its end, all laps of it or until it was ended."""
+    """Fly one flight; return the exit status: 0 if it flew, passed the gates of all laps=, and was not cut off."""
     with ExitStack() as opened:
         with plainly():
             flight = prepare(config, opened)
-        ended = flight.loop.run(config.duration, config.patience)  # what breaks in flight is a defect: it shows as one
+        ended = flight.loop.run(config.duration, config.patience)  # errors in flight are defects: with traceback
         with plainly():
             opened.close()
             summary = conclude(config, flight, ended)
@@ -162,7 +162,7 @@ def prepare(config: HilConfig, opened: ExitStack) -> Prepared:
 
 
 def conclude(config: HilConfig, flight: Prepared, ended: str) -> dict[str, Any]:
-    """Return what came of a flight, and write it beside its recording."""
+    """Return the summary of a flight, and write it beside its recording."""
     chain = flight.chain
     summary = {
         "ended": ended,
@@ -179,7 +179,7 @@ def conclude(config: HilConfig, flight: Prepared, ended: str) -> dict[str, Any]:
 
 
 def battery_summary(config: HilConfig, chain: FlightChain, link: TransportLink) -> dict[str, Any] | None:
-    """Return what the thrust map reckoned with at the end, and what was heard; None where there is no thrust map."""
+    """Return the thrust map's voltage at the end, and counts of battery readings; None without a thrust map."""
     if link.thrust is None:
         return None
     summary = {"voltage_set": config.voltage, "voltage": link.thrust.voltage, "rejected": link.rejected}
@@ -195,7 +195,7 @@ def as_json(config: HilConfig) -> dict[str, Any]:
 
 
 def say(summary: dict[str, Any]) -> None:
-    """Print what came of a flight."""
+    """Print the summary of a flight."""
     laps = ", ".join(f"{lap:.2f} s" for lap in summary["laps"]) or "none"
     print(f"ended: {summary['ended']}")
     print(f"gates passed: {len(summary['passes'])}, laps, from first gate to first gate: {laps}")
@@ -211,7 +211,7 @@ def say(summary: dict[str, Any]) -> None:
 
 
 def in_words(battery: dict[str, Any]) -> str:
-    """Say by which voltage thrust became a throttle, and where that came from."""
+    """Return, in words, the voltage that the thrust map used, and where it came from."""
     if not battery["readings"]:
         return f"battery: nothing usable was heard of it; thrust was reckoned by voltage={battery['voltage_set']:g}"
     age = battery["last_reading_age_s"]
@@ -221,11 +221,11 @@ def in_words(battery: dict[str, Any]) -> str:
 
 
 def replay(config: HilConfig) -> int:
-    """Play a flight through the chain again; return 0 if every tick comes out as it was written, 1 otherwise."""
+    """Replay a recorded flight through the chain; return 0 if the outputs of all ticks are as recorded, else 1."""
     assert config.replay is not None, "checked"
     flight = Flight(Path(config.replay))
     try:
-        written = {"lift": 0.0, **flight.about["config"]}  # flights of old were not lifted
+        written = {"lift": 0.0, **flight.about["config"]}  # older flights had no lift
         flown = OmegaConf.to_object(OmegaConf.merge(OmegaConf.structured(HilConfig), written))
     except (KeyError, TypeError, OmegaConfBaseException) as error:
         raise ValueError(
@@ -243,7 +243,7 @@ def replay(config: HilConfig) -> int:
 
 
 def play(flight: Flight, chain: FlightChain) -> int:
-    """Put every tick of a flight through a chain; return 0 if all come out as they were written, 1 otherwise."""
+    """Pass every tick of a flight through a chain; return 0 if all outputs are as recorded, else 1."""
     chain.warm_up()
     for index, tick in enumerate(flight.ticks):
         again = json.loads(json.dumps(describe_outputs(chain.tick(read_inputs(tick["in"])))))
@@ -256,7 +256,7 @@ def play(flight: Flight, chain: FlightChain) -> int:
 
 
 def same(one: Any, other: Any) -> bool:
-    """Whether two JSON values are equal, bit for bit, not-a-number included."""
+    """Return whether two JSON values are equal, bit for bit; NaN equals NaN."""
     if isinstance(one, list) and isinstance(other, list):
         return len(one) == len(other) and all(map(same, one, other))
     if isinstance(one, float) and isinstance(other, float) and math.isnan(one):
@@ -265,7 +265,7 @@ def same(one: Any, other: Any) -> bool:
 
 
 def report(config: HilConfig) -> int:
-    """Draw a flight and sum it up."""
+    """Draw a recorded flight and print its summary."""
     from dreamer_racing.figures.hil import write_report
 
     assert config.report is not None, "checked"

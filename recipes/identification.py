@@ -1,11 +1,11 @@
-"""Finds the numbers of a vehicle's rate loop, motors and thrust from a flight, and writes a drone that agents train on.
+"""Fit the parameters of a vehicle's rate loop, motors and thrust to a flight, and write a drone for training.
 
     python recipes/hil.py actor=identify track=circle arm=true     # flies what tells most: small steps about a hover
     python recipes/identification.py flight=runs/hil_circle_20260101-120000 output=drone.yaml
     python recipes/dreamer_v3.py env=betaflight env.preset=drone.yaml
 
-Any flight of recipes/hil.py that moves all axes will do, and so does a table (.csv, .csv.gz) with a row a ms. What it
-does not tell stays as preset= has it, and is said. More: docs/betaflight.md, "Your own drone".
+Any flight of recipes/hil.py that moves all axes will do, or a table (.csv, .csv.gz) with one row per ms. Parameters
+that it does not determine stay as in preset=, and are named. More: docs/betaflight.md, "Your own drone".
 """
 
 import logging
@@ -24,14 +24,14 @@ if TYPE_CHECKING:
 
 @dataclass
 class IdentificationConfig:
-    """`recipes/identification.py`."""
+    """Configuration of `recipes/identification.py`."""
 
-    flight: str | None = None  # what was flown: a folder of recipes/hil.py, its file, or a table
-    preset: str = "betaflight"  # where to begin: a preset with a Betaflight, or a drone's file; mass and inertia stay
+    flight: str | None = None  # recorded flight: folder of recipes/hil.py, its file, or a table
+    preset: str = "betaflight"  # initial values: a preset with a Betaflight, or a drone's file; mass and inertia stay
     output: str = "drone.yaml"  # the file to write
 
     def check(self) -> None:
-        """Refuse what could only fail once all is done."""
+        """Refuse an output name that would fail only after the fit."""
         if not self.output.endswith(SUFFIXES):
             raise ValueError(f"output={self.output}: the name of the file must end in {' or '.join(SUFFIXES)}.")
 
@@ -44,10 +44,10 @@ def main(config: IdentificationConfig) -> None:
 
 
 def identify(config: IdentificationConfig) -> None:
-    """Do all of it, and print what came of it.
+    """Fit a drone to the flight, write it, and print the results.
 
     Raises:
-        ValueError: There is no such flight, it is too short or too quiet, or the preset has no Betaflight.
+        ValueError: The flight is missing, too short or too quiet, the preset has no Betaflight, or the fit diverged.
     """
     if config.flight is None:
         raise ValueError("flight= is missing: a folder in which recipes/hil.py flew, or a table.")
@@ -72,7 +72,7 @@ def identify(config: IdentificationConfig) -> None:
 
 
 def say(config: IdentificationConfig, found: "Fit") -> None:
-    """Print what was found."""
+    """Print the fitted parameters."""
     print(f"{'':<10}{'relative':>10}{'±':>8}  (to {config.preset}; delay in ms, added)")
     for name, value in found.values.items():
         scale = 1e3 if name == "delay" else 1.0

@@ -37,7 +37,7 @@ def main(config: DictConfig) -> None:
 
 def train(config: LatentPPORunConfig, session: Session) -> None:
     """Collect, replay, update, evaluate, save."""
-    own = share_of(config)  # of several processes
+    own = share_of(config)  # of this process
     env = make_own_env(own)
     learner = cast(LatentPPO, building.make_learner(own, Interface.of(env), own.device, config.seed))
     if config.init_from and not config.resume:
@@ -50,7 +50,7 @@ def train(config: LatentPPORunConfig, session: Session) -> None:
     ratio = config.make_replay_ratio()
     schedule = Schedule(config.schedule, config.scheduled, config.total_env_steps, building.num_gates(env))
     lag = ModelLag(config.schedule.wait_for_model, config.schedule.wait_every)
-    own_parts: dict[str, Any] = {} if parallel.is_first() else {"storage": learner.storage}  # else in the learner's
+    own_parts: dict[str, Any] = {} if parallel.is_first() else {"storage": learner.storage}  # rank 0: by the learner
     session.track(
         learner=learner,
         env=env,
@@ -67,7 +67,7 @@ def train(config: LatentPPORunConfig, session: Session) -> None:
     )
 
     for rollout in session.rollouts():
-        # Replay what was collected, and keep it for the actor; a resumed run first makes the updates that are due.
+        # Add the rollout to the replay and to the actor's storage; a resumed run first makes the updates that are due.
         if rollout is not None:
             replay.extend(rollout)
             learner.collect(rollout)
@@ -75,7 +75,7 @@ def train(config: LatentPPORunConfig, session: Session) -> None:
             session.log(curriculum.adapt(episodes))
             session.log(schedule.observe(episodes, session.env_steps))
 
-        # Move what is scheduled; the actor waits while the model does not know the newest records.
+        # Apply the schedules; the actor waits while the model's error on the newest records is too large.
         if lag.due(session.env_steps) and session.counters["updates"]:
             session.log(building.measure_lag(session, config, learner, replay, lag))
         scheduled = schedule.at(session.env_steps)
@@ -91,7 +91,7 @@ def train(config: LatentPPORunConfig, session: Session) -> None:
             metrics = learner.update(batch, session.timed)
             session.log(metrics)
             lag.trained(metrics)
-            if config.replay.context and learner.latents is not None:  # later windows go on from the latents of now
+            if config.replay.context and learner.latents is not None:  # later windows begin with these latents
                 replay.refresh(batch["index"], learner.latents["belief"], learner.latents["state"])
 
         # Evaluate, log and save.

@@ -31,16 +31,16 @@ from dreamer_racing.training.directory import fresh_directory, replace_text
 
 RESULT = "perception.json"
 WITHOUT, WITH = "without decoys", "with decoys"
-NO_NOISE, START_NOISE = 0.0, 1.0  # of starts, in units of training's; with it no two flights are the same
+NO_NOISE, START_NOISE = 0.0, 1.0  # noise of starts, in units of training's; with it no two flights are the same
 START_TEXT = {NO_NOISE: "From the start pose:\n", START_NOISE: "From starts with the noise of training:\n"}
 
 
 @dataclass
 class PerceptionConfig(FlightConfig):
-    """`recipes/perception.py`."""
+    """Configuration of `recipes/perception.py`."""
 
-    num_envs: int | None = setting(None, COUNT)  # as of `recipes/evaluate.py`; the first flight in each is looked at
-    decoys: str | None = None  # +decoys=paper; null: those that the track has a place for, if any
+    num_envs: int | None = setting(None, COUNT)  # null: one per episode; sight is measured in the first flight of each
+    decoys: str | None = None  # +decoys=paper; null: those that the track defines, if any
     run_dir: str | None = None  # null: <run of the checkpoint>/perception
 
 
@@ -63,7 +63,7 @@ def main(config: PerceptionConfig) -> None:
 
 @dataclass
 class Looked:
-    """Flights of one kind, and what the camera was turned to in them."""
+    """Results of the flights without or with decoys, and what the camera was pointed at."""
 
     track: Track
     gates_per_episode: float
@@ -72,7 +72,7 @@ class Looked:
     sights: dict[str, Sight]
 
     def to_dict(self) -> dict[str, Any]:
-        """Return the numbers; nothing but what JSON knows."""
+        """Return the numbers as JSON values."""
         return {
             "gates_per_episode": self.gates_per_episode,
             "success_rate": self.success_rate,
@@ -81,7 +81,7 @@ class Looked:
 
 
 def tracks_to_fly(trained: RunConfig) -> dict[str, Track]:
-    """The track without decoys and, if it has a place for them, with them."""
+    """Return the track without decoys and, if it defines places for them, with them."""
     track = trained.track_as_begun()
     if trained.decoys is None and not track.decoys:
         track = with_decoys(track, decoys_for(track))
@@ -95,7 +95,7 @@ def tracks_to_fly(trained: RunConfig) -> dict[str, Track]:
 def fly_and_look(config: PerceptionConfig, restored: Restored, tracks: dict[str, Track]) -> dict[str, Looked]:
     """Fly the deterministic policy without and with decoys from the same noisy starts; measure what it looked at."""
     worlds = worlds_of(restored.trained) | {"start_noise": START_NOISE, "seed": config.seed}
-    decoys = next(reversed(tracks.values())).decoys  # without them too: where they would stand
+    decoys = next(reversed(tracks.values())).decoys  # also for flights without: where they would stand
     looked = {}
     for name, track in tracks.items():
         flown = fly(
@@ -113,7 +113,7 @@ def fly_and_look(config: PerceptionConfig, restored: Restored, tracks: dict[str,
 
 
 def fly_corrupted(config: PerceptionConfig, restored: Restored, start_noise: float) -> list[Result]:
-    """Fly the policy in both modes on the track as it was asked for, with every corruption of its images."""
+    """Fly the policy in both modes on the requested track, with every corruption of its images."""
     trained = restored.trained
     worlds = worlds_of(trained) | {"start_noise": start_noise, "seed": config.seed}
     results = []
@@ -133,7 +133,7 @@ def write(
     provenance: dict[str, Any],
     camera: Camera,
 ) -> None:
-    """Write numbers, tables and the plot; flights with corrupted images are by the noise of starts."""
+    """Write numbers, tables and the plot; `corrupted` maps the noise of starts to flights with corrupted images."""
     title = f"{provenance['algorithm']} on {provenance['track']}, {provenance['env_steps']:,} env_steps"
     flights = {name: (kind.track, kind.trajectory, kind.sights) for name, kind in looked.items()}
     plot_sight(flights, camera, directory / "perception.png", title)
@@ -153,7 +153,7 @@ def write(
 def to_markdown(
     title: str, looked: dict[str, Looked], corrupted: dict[float, list[Result]], provenance: dict[str, Any]
 ) -> str:
-    """Return the tables as a page."""
+    """Return the tables as a Markdown page."""
     parts = [heading(title, provenance), "## What the camera is turned to\n", START_TEXT[START_NOISE]]
     sights = {name: kind.sights for name, kind in looked.items()}
     parts += [sight_table(sights), "Share of time in view, gate by gate:\n", gate_table(sights)]

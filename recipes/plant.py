@@ -1,16 +1,16 @@
-"""A drone to fly instead of a real one: this project's physics in a process of its own, not quite as in training.
+"""Simulate a drone in a process of its own, to be flown instead of a real one: it may differ from that of training.
 
     python recipes/plant.py track=figure8 mass=1.1 thrust=0.9 delay=0.02 packet_loss=0.01
     python recipes/plant.py track=kidney firmware=auto      # flown by a Betaflight of this machine, which it starts
     python recipes/plant.py track=kidney betaflight=2026.6  # the same, by one that runs already
 
 It takes commands from UDP port 9101 and sends poses to port 9100, both on this machine, until it is stopped by Ctrl+C
-or SIGTERM, and says at the end what came of it. The drone stands on a launch stand at the track's start pose, until a
-disarmed command and then armed ones with thrust have come.
+or SIGTERM, and prints a summary at the end. The drone stands on a launch stand at the track's start pose, until a
+disarmed command and then armed ones with thrust have arrived.
 
-With firmware= a Betaflight that was built for this machine (SITL) is set up for actor=, started, and flies it by its
-motors; channels go to the firmware. auto is the one of BETAFLIGHT_SITL=/path/to/betaflight_SITL.elf, or of the extra
-sitl. With betaflight= one does that runs already.
+With firmware= a Betaflight that was built for this machine (SITL) is set up for actor=, started, and commands the
+motors; RC channels go to the firmware. auto is that of BETAFLIGHT_SITL=/path/to/betaflight_SITL.elf, or of the extra
+sitl. With betaflight= the firmware is one that is already running.
 """
 
 from dataclasses import dataclass
@@ -28,15 +28,15 @@ from dreamer_racing.plant.vehicle import Mismatch, PlantVehicle
 
 @dataclass
 class PlantConfig(ProcessOptions, Delivery, Mismatch):
-    """`recipes/plant.py`: which drone, and all that `Mismatch`, `Delivery` and `ProcessOptions` say."""
+    """Configuration of `recipes/plant.py`: the drone, and the settings of its three base classes."""
 
     track: str = "kidney"  # built-in track, or path to a YAML file
-    preset: str = "faithful"  # physics of the nominal drone, without their randomisation: easy | faithful | betaflight
-    # with firmware=: for whose largest body rates it is set up: pilot, an agent's name, or its path
+    preset: str = "faithful"  # physics of the nominal drone, without randomisation: easy | faithful | betaflight
+    # with firmware=: pilot, or name or path of an agent, whose largest body rates it is set up for
     actor: str = "pilot"
 
     def check(self) -> None:
-        """Refuse a delay where nothing would be delayed, and an actor for whom nothing is set up."""
+        """Refuse a command delay if a firmware flies, and an actor without a firmware to set up for it."""
         if self.delay is not None and (name := by_firmware(self)):
             raise ValueError(f"delay={self.delay} is of commands, and {name}={getattr(self, name)}: leave one out.")
         if self.actor != PILOT and self.firmware is None:
@@ -56,7 +56,7 @@ def main(config: PlantConfig) -> None:
 
 
 def settings_for(actor: str) -> list[str]:
-    """Return lines for the CLI of a firmware that an actor is to fly."""
+    """Return CLI lines that set up a firmware for an actor."""
     if actor == PILOT:
         return print_settings(pilot_contract(HilConfig(actor=PILOT)), "betaflight_sitl")
     return print_settings(read_contract(existing_agent_path("actor", actor)), "betaflight_sitl")

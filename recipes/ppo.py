@@ -49,7 +49,7 @@ def train(config: PPORunConfig, session: Session) -> None:
 
     for rollout in session.rollouts():
         if rollout is not None:
-            # Every rollout is learned from in some epochs, and forgotten.
+            # Every rollout is trained on for some epochs, then discarded.
             session.log(curriculum.adapt(session.log_episodes(rollout)))
             session.log(learner.update(rollout, session.timed))
             session.counters["updates"] = learner.updates

@@ -23,7 +23,7 @@ from dreamer_racing.modules import Interface
 from dreamer_racing.training.session import Session
 
 resolve = partial(resolve_baseline, num_envs={"pixels": 64, "state": 256})
-TRANSITION = 2  # records of a window: what was seen before an action, and after it
+TRANSITION = 2  # records of a window: before and after an action
 
 
 @recipe("sac", SACRunConfig, composed=True)

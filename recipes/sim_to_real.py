@@ -1,4 +1,4 @@
-"""How much a real drone may differ from the simulated one: success and lap time as one thing at a time is changed.
+"""Measure how much a real drone may differ from the simulated one: success and lap time over one change at a time.
 
     python recipes/sim_to_real.py actor=kidney preset=easy
     python recipes/sim_to_real.py actor=pilot track=figure8 flights=10 processes=2
@@ -36,23 +36,23 @@ RESULT, RESULT_BESIDE = "sim_to_real.json", "sim_to_real_pilot.json"
 
 @dataclass
 class SimToRealConfig:
-    """`recipes/sim_to_real.py`."""
+    """Configuration of `recipes/sim_to_real.py`."""
 
-    actor: str = PILOT  # pilot, an agent that ships by its name, or the path of an agent
+    actor: str = PILOT  # pilot, name of an included agent, or path of an agent
     track: str | None = None  # built-in track, or path to a YAML file; null: what the actor was trained on
     preset: str = "faithful"  # physics before anything is changed: easy | faithful | betaflight
     rate: float = setting(50.0, Range(10, 500))  # Hz, of the pilot; an actor has its own
-    flights: int = setting(5, COUNT)  # of each value, with different noise
-    sweeps: list[str] | None = None  # of what is changed; null: all
-    processes: int | None = setting(None, COUNT)  # that fly at a time; null: one for each core
-    # in the same picture: pilot flies the same too; or sim_to_real.json of another study
+    flights: int = setting(5, COUNT)  # per value, with different noise
+    sweeps: list[str] | None = None  # parameters to change, one at a time; null: all
+    processes: int | None = setting(None, COUNT)  # that fly in parallel; null: one per core
+    # second study in the same picture: pilot, which flies it too, or sim_to_real.json of another one
     beside: str | None = None
     run_dir: str | None = None  # null: runs/sim_to_real_<track>_<time>
 
 
 @recipe("sim_to_real", SimToRealConfig)
 def main(config: SimToRealConfig) -> None:
-    """Fly all of it, print a table, write files."""
+    """Fly the study, print each flight, write the files."""
     with plain_errors():
         track, make_flyer = check(config)
         folder = Path(config.run_dir) if config.run_dir else new_run_dir("sim_to_real", track.name)
@@ -71,7 +71,7 @@ def main(config: SimToRealConfig) -> None:
 
 
 def fly(actor: str, make_flyer: Callable[[], Flyer], track: Track, config: SimToRealConfig) -> dict[str, Any]:
-    """Fly every value of every sweep, print what came of each flight, and return all with where it comes from."""
+    """Fly every value of every sweep, print each result, and return all results with their provenance."""
     flown = []
     sweeps, processes = config.sweeps or list(SWEEPS), config.processes or available_cpus()
     for flight in study(make_flyer, track, config.preset, config.flights, sweeps, processes):
@@ -84,7 +84,7 @@ def fly(actor: str, make_flyer: Callable[[], Flyer], track: Track, config: SimTo
 
 
 def check(config: SimToRealConfig) -> tuple[Track, Callable[[], Flyer]]:
-    """Return the track and what makes the flyer.
+    """Check the settings; return the track and the factory of the flyer.
 
     Raises:
         ValueError: the message names the field and what is allowed.
@@ -109,7 +109,7 @@ def check(config: SimToRealConfig) -> tuple[Track, Callable[[], Flyer]]:
 
 
 def pilot_on(track: Track, config: SimToRealConfig) -> Callable[[], Flyer]:
-    """Return what makes the pilot."""
+    """Return the factory of the pilot."""
     return partial(PilotFlyer, track, config.preset, config.rate)
 
 

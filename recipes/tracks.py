@@ -1,4 +1,4 @@
-"""Lists the race tracks, yours too: gates, laps, length, the least distance between gates; and draws them.
+"""List race tracks, also your own: gates, laps, length, the least distance between gates; and draw them.
 
     python recipes/tracks.py
     python recipes/tracks.py picture=tracks.png
@@ -24,11 +24,11 @@ PICTURES = (".png", ".pdf", ".svg")
 
 @dataclass
 class TracksConfig:
-    """`recipes/tracks.py`."""
+    """Configuration of `recipes/tracks.py`."""
 
     track: str | None = None  # built-in track, or path to a YAML file; null: all built-in ones
     picture: str | None = None  # file to draw them into, as maps from above and from the side: .png, .pdf or .svg
-    json: bool = False  # for programs, on stdout; --json does the same
+    json: bool = False  # print JSON on stdout, for programs; --json does the same
 
     def check(self) -> None:
         """Refuse a picture of an unknown kind."""
@@ -44,7 +44,7 @@ def main(config: TracksConfig) -> None:
     found = [measures(track) for track in tracks]
     print(json.dumps(found, indent=1) if config.json else "\n".join(table(found)))
     if config.picture is not None:
-        from dreamer_racing.figures.tracks import plot_tracks  # takes far longer than the list
+        from dreamer_racing.figures.tracks import plot_tracks  # importing it takes far longer than the list
 
         with plain_errors():
             plot_tracks(tracks, config.picture)
@@ -53,7 +53,7 @@ def main(config: TracksConfig) -> None:
 
 
 def measures(track: Track) -> dict[str, Any]:
-    """Return what is listed of a track; lengths in m, of centres of gates."""
+    """Return the listed properties of a track; lengths in m, between centres of gates."""
     return {
         "track": track.name,
         "gates": track.num_gates,
@@ -66,7 +66,7 @@ def measures(track: Track) -> dict[str, Any]:
 
 
 def table(found: Sequence[dict[str, Any]]) -> Iterator[str]:
-    """Yield the list's lines."""
+    """Yield the lines of the table."""
     width = max(len("track"), *(len(row["track"]) for row in found))
     yield f"{'track':<{width}}  gates  decoys  laps  lap (m)  least gap (m)  box (m)"
     for row in found:

@@ -1,4 +1,4 @@
-"""Settings of the worlds that an agent trains in, and what is refused of them before any are made."""
+"""Configuration of the training and evaluation environments, and its checks before any environment is made."""
 
 from __future__ import annotations
 
@@ -17,49 +17,49 @@ from dreamer_racing.settings import COUNT, NOT_NEGATIVE, POSITIVE, SHARE, Range,
 
 SUITES = ("race", "dmc")
 EVERYWHERE = ("suite", "num_envs", "device", "episode_steps", "from_pixels", "image_size")
-"""Settings that are not for races alone."""
-MISSING = "???"  # OmegaConf's word for what must be given, which this package does not import for it
+"""Settings that apply to every suite."""
+MISSING = "???"  # OmegaConf's marker of a mandatory value; this package does not import OmegaConf
 IN_TRAINING = (
     "episode_steps", "start_beyond_gate", "start_at_gate", "start_on_line", "miss_radius", "action_change_weight",
     "looks",
 )  # fmt: skip
-"""What is set of a race to train in, and not of one to be evaluated in."""
+"""Settings of training races that evaluation races do not take."""
 
 
 @dataclass
 class EnvConfig:
-    """Where the agent acts: the race, or a task of the DeepMind Control Suite to compare with published curves."""
+    """Environment configuration: the race, or a DeepMind Control Suite task to compare with published curves."""
 
     suite: str = "race"  # race | dmc
     preset: str = "easy"  # physics: easy | faithful | betaflight
-    num_envs: int = setting(MISSING, COUNT)  # worlds flown side by side; missing: the recipe's own number
-    control_rate: float = setting(50.0, Range(MIN_CONTROL_RATE))  # actions a second, Hz
-    # frames a second, Hz, control_rate divided by a whole number; null: one at every control step
+    num_envs: int = setting(MISSING, COUNT)  # parallel environments; missing: the recipe's own number
+    control_rate: float = setting(50.0, Range(MIN_CONTROL_RATE))  # actions per second, Hz
+    # camera frames per second, Hz: control_rate divided by a whole number; null: one frame per control step
     camera_rate: float | None = setting(None, POSITIVE)
-    # gyro and accelerometer, seen beside the images: none | exact | noisy
+    # gyro and accelerometer, observed beside the images: none | exact | noisy
     imu: str = "none"
-    # module:function of your own in place of Eq. 1 of the paper (docs/own_rewards.md); null: that
+    # module:function of a user-defined reward (docs/own_rewards.md); null: Eq. 1 of the paper
     reward: str | None = None
-    # module:function of your own, whose numbers the agent sees, too (docs/own_rewards.md); null: none beside images
+    # module:function of a user-defined vector observation (docs/own_rewards.md); null: none beside images
     vector: str | None = None
-    # control steps of a training episode; null: those of 20 s, with env=dmc those of the task
+    # control steps per training episode; null: 20 s, or with env=dmc the task's time limit
     episode_steps: int | None = setting(None, COUNT)
-    # share of training episodes, but for those on a line, that begin behind a gate, to practise turns
+    # share of the training episodes not on the racing line that begin behind a gate, to practise turns
     start_beyond_gate: float = setting(0.0, SHARE)
-    # share of those that begin neither there nor on a line, that begin in flight before a gate instead of at the start
+    # share of the training episodes neither behind a gate nor on the line that begin before a gate, not at the start
     start_at_gate: float = setting(0.5, SHARE)
     # share of training episodes that begin in flight on a planned racing line
     start_on_line: float = setting(0.0, SHARE)
-    # m; training episodes end where a gate is missed by less than this; 0: they go on
+    # m; a training episode ends if a gate is missed by less than this distance; 0: it goes on
     miss_radius: float = setting(0.0, NOT_NEGATIVE)
-    # b3, penalty in training for each unit of |a_t - a_t-1|^2; 0: none, as in the paper; 1e-4 in champion-level racing
+    # b3, penalty in training per unit of |a_t - a_t-1|^2; 0: none, as in the paper; 1e-4 in champion-level racing
     action_change_weight: float = setting(0.0, NOT_NEGATIVE)
-    # of the worlds, to train and to be evaluated in: cpu | cuda | auto, which takes the learner's where it can
+    # device of the training and evaluation environments: cpu | cuda | auto (the learner's if supported)
     device: str = "auto"
     renderer: str = "auto"  # auto | egl | osmesa | warp | warp_cuda; on cuda auto | warp
     looks: str = "nominal"  # in training: nominal | randomised (light, colours, camera tilt, lens, noise)
-    from_pixels: bool = True  # false: the agent sees the numbers of `vector` instead of images
-    image_size: int = 64  # pixels, side of the images: a multiple of 16, by which the networks divide it
+    from_pixels: bool = True  # false: the agent observes `vector` instead of images
+    image_size: int = 64  # pixels, width and height of the images: a multiple of 16, the networks' stride
     camera_tilt: float = 25.0  # degrees upwards
 
     @property
@@ -69,20 +69,20 @@ class EnvConfig:
 
     @property
     def measured(self) -> str | None:
-        """Inertial measurements, as `DroneRacingEnv` takes them."""
+        """The `imu` argument of `DroneRacingEnv`."""
         return None if self.imu == "none" else self.imu
 
     def arguments(self) -> dict[str, Any]:
-        """Return what every `DroneRacingEnv` is given, to train in and to be evaluated in, but for the track."""
+        """Return the arguments of every `DroneRacingEnv`, for training and evaluation, without the track."""
         same = ("preset", "renderer", "control_rate", "from_pixels", "reward", "vector", "device")
         return {"camera": self.camera, "imu": self.measured, **{name: getattr(self, name) for name in same}}
 
     def training_arguments(self) -> dict[str, Any]:
-        """Return what one to train in is given besides."""
+        """Return the further arguments of a training `DroneRacingEnv`."""
         return {name: getattr(self, name) for name in IN_TRAINING}
 
     def check(self) -> None:
-        """Refuse worlds that cannot be where they are to be, and what is not for their suite.
+        """Refuse an unsupported device and settings that do not apply to the suite.
 
         Raises:
             ValueError: the message names the setting.
@@ -103,7 +103,7 @@ class EnvConfig:
                 raise ValueError(f"env.{name}={value} is for races, and env.suite={self.suite}: leave it at {usual}.")
 
     def check_race(self, track: Track) -> None:
-        """Refuse what the parts of a race on a track would refuse later.
+        """Refuse race settings that would fail later, when the environment is made.
 
         Raises:
             ValueError: the message names the setting.
@@ -120,7 +120,7 @@ class EnvConfig:
             raise ValueError(f"env.{error}") from error
 
     def try_own(self, track: Track) -> None:
-        """Refuse a reward or numbers of a user's own that are not as they should be: fly a step by them."""
+        """Check user-defined reward and vector functions by running them for one step."""
         if self.reward is None and self.vector is None:
             return
         if self.vector is not None and self.measured:

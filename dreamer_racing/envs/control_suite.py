@@ -1,11 +1,11 @@
-"""`ControlSuiteEnv`: tasks of the DeepMind Control Suite, to compare an agent with published curves away from the race.
+"""`ControlSuiteEnv`: tasks of the DeepMind Control Suite, to compare an agent with published learning curves.
 
-Keys, as those of `DroneRacingEnv` where both have them:
+Keys, named as in `DroneRacingEnv` where both have them:
 
 | key | shape | meaning |
 |---|---|---|
 | `pixels` | (N, height, width, 3) uint8 | the task's camera, 64 × 64 by default, only with `from_pixels=True` |
-| `vector` | (N, V) float32 | all observations of the task in a row, only with `from_pixels=False` |
+| `vector` | (N, V) float32 | all observations of the task, concatenated, only with `from_pixels=False` |
 | `action` | (N, A) float32 | in [-1, 1], scaled to the range of each actuator |
 | `reward` | (N, 1) float32 | summed over the action repeat |
 | `terminated` | (N, 1) bool | the task ended with discount 0; of the suite's tasks only those of `lqr` do |
@@ -14,11 +14,11 @@ Keys, as those of `DroneRacingEnv` where both have them:
 
 Camera, default image size, action repeat and time limit are those of DreamerV3's `dmc_vision`.
 
-Images are dm_control's, with the same shadows, reflections, sky and four samples a pixel, but of a shadow map and of
-round shapes no finer than so small an image shows: drawn in software they are what takes most of the time.
-What that changes (`benchmarks/control_suite.py` of commit b53e9fa measured it): in 64 × 64 less than 0.5 of 255 on
-average in 19 of 20 tasks, and 1.9 in `quadruped_escape`, whose shadows lie on a whole terrain. In 32 × 32 it is 1.6
-in `reacher_easy`.
+Images are dm_control's, with the same shadows, reflections, sky and four samples a pixel, but with a coarser shadow map
+and fewer facets on round shapes, which take most of the time of software rendering and do not show in small images.
+The mean difference (measured by `benchmarks/control_suite.py` of commit b53e9fa) in 64 × 64 is less than 0.5 of 255 in
+19 of 20 tasks, and 1.9 in `quadruped_escape`, whose shadows lie on a whole terrain. In 32 × 32 it is 1.6 in
+`reacher_easy`.
 
 Shapes: N worlds, V observation, A action.
 
@@ -46,34 +46,34 @@ from torchrl.envs import EnvBase
 from dreamer_racing.settings import check_numbers, without_none
 
 TASKS = {f"{domain}_{name}": (domain, name) for domain, name in suite.ALL_TASKS}
-"""Domain and task of the suite by the name `domain_task`."""
-CAMERAS = {"quadruped": 2}  # by domain; 0 for all others
+"""Domain and task of the suite, by the name `domain_task`."""
+CAMERAS = {"quadruped": 2}  # camera number by domain; 0 for all others
 DETAIL = {"shadowsize": 4.0, "numslices": 0.25, "numstacks": 0.125}
-"""MuJoCo's `visual/quality` for each pixel of an image's width: texels of the shadow map along a side, facets around
-and along a capsule, a cylinder or a sphere. Never more than the task's own, nor less than for 64 pixels."""
-PHYSICS_STATE = mujoco_bindings.mjtState.mjSTATE_INTEGRATION  # all that MuJoCo's next step depends on
+"""MuJoCo's `visual/quality` per pixel of the image width: texels of the shadow map along a side, facets around and
+along a capsule, a cylinder or a sphere. Limited to the task's own values, and computed for at least 64 pixels."""
+PHYSICS_STATE = mujoco_bindings.mjtState.mjSTATE_INTEGRATION  # everything MuJoCo's next step depends on
 
 
 class ControlSuiteEnv(EnvBase):
     """N worlds of one task, stepped one after the other in one process.
 
-    A world whose episode has ended stands still, without reward, until it is reset. Actions beyond [-1, 1] are clipped;
-    one that is not finite is an error, as in the reference, because no task of the suite has a rule for it. OpenGL
-    binds images to the thread that made the environment: step and close it there.
+    A world whose episode has ended does not step, with reward 0, until it is reset. Actions beyond [-1, 1] are clipped;
+    a non-finite action is an error, as in the reference, because no task of the suite has a rule for it. An OpenGL
+    context belongs to the thread that made the environment: step and close it there.
 
     Args:
         task: `domain_task` of `dm_control.suite`, for example `cartpole_swingup` or `ball_in_cup_catch`; see `TASKS`.
         num_envs: N; the batch size is [N].
-        device: where tensors live; the simulation itself runs on CPU.
-        from_pixels: whether there are `pixels`; if not there is a `vector` instead.
-        action_repeat: simulator steps that an action lasts; an episode is 1000 simulator steps.
-        episode_steps: actions after which an episode is truncated, where that is sooner; None: nowhere.
-        camera: number or name of the task's camera; if None that of the reference.
+        device: device of the tensors; the simulation itself runs on CPU.
+        from_pixels: whether to observe `pixels`; if not, `vector` instead.
+        action_repeat: simulator steps per action; an episode is 1000 simulator steps.
+        episode_steps: actions after which an episode is truncated, if before the task's time limit; None for no limit.
+        camera: number or name of the task's camera; None for the reference's.
         image_size: width and height of `pixels`.
-        seed: of the worlds; None draws one from the operating system.
+        seed: seed of the worlds; None draws one from the operating system.
 
     Raises:
-        ValueError: bad argument; the message says which and what is allowed.
+        ValueError: invalid argument; the message says which and what is allowed.
         RendererUnavailableError: dm_control has no OpenGL that works here.
 
     Example:
@@ -106,7 +106,7 @@ class ControlSuiteEnv(EnvBase):
         self.worlds: list[SuiteWorld] = []
         self._set_seed(seed)
         self._make_specs()
-        self.is_closed = False  # TorchRL takes an environment that it does not wrap for one that has nothing to close
+        self.is_closed = False  # by default TorchRL regards an unwrapped environment as closed
 
     def _make_specs(self) -> None:
         n, world = self.batch_size, self.worlds[0]
@@ -124,7 +124,7 @@ class ControlSuiteEnv(EnvBase):
             shape, dtype = (*n, world.vector_size), torch.float32
             observation = {"vector": Unbounded(shape, dtype=dtype, device=self.device)}
         self.observation_spec = Composite(observation, shape=n, device=self.device)
-        self._observations = torch.zeros(shape, dtype=dtype)  # (N, ...), the latest of each world
+        self._observations = torch.zeros(shape, dtype=dtype)  # (N, ...), the latest observations
 
     def _reset(self, tensordict: TensorDictBase | None, **kwargs: Any) -> TensorDictBase:
         mask = tensordict.get("_reset", None) if tensordict is not None else None
@@ -158,7 +158,7 @@ class ControlSuiteEnv(EnvBase):
             )
 
     def _data(self) -> TensorDict:
-        """What there is after a reset as after a step."""
+        """Return the entries common to a reset and a step."""
         terminated = torch.tensor([[world.terminated] for world in self.worlds], device=self.device)
         truncated = torch.tensor([[world.truncated] for world in self.worlds], device=self.device)
         return TensorDict(
@@ -173,7 +173,7 @@ class ControlSuiteEnv(EnvBase):
         )
 
     def _set_seed(self, seed: int | None) -> None:
-        """Make all worlds anew: some tasks draw from their seed when they are made, not only when they are reset."""
+        """Recreate all worlds: some tasks use their seed on construction, not only on reset."""
         seeds = np.random.SeedSequence(seed).generate_state(self.batch_size.numel())
         self._free_worlds()
         for number in seeds:
@@ -184,17 +184,17 @@ class ControlSuiteEnv(EnvBase):
         return SuiteWorld(self.task, seed, self.camera if self.from_pixels else None, self.image_size, limit)
 
     def state_dict(self) -> dict[str, Any]:
-        """What an environment with the same arguments needs to go on exactly as this one would, bit for bit.
+        """Return the state with which an environment with the same arguments continues bit for bit like this one.
 
-        Tensors and plain Python values, as `torch.save` and `torch.load(weights_only=True)` take them.
+        It has only tensors and plain Python values, for `torch.save` and `torch.load(weights_only=True)`.
         """
         return {"task": self.task, "worlds": [world.state_dict() for world in self.worlds]}
 
     def load_state_dict(self, state_dict: Mapping[str, Any]) -> None:
-        """Go on from what `state_dict` returned; takes as long as making and resetting every world.
+        """Restore what `state_dict` returned; takes as long as making and resetting every world.
 
         Raises:
-            ValueError: the state is of another task or of another number of worlds.
+            ValueError: the state is of another task or number of worlds.
         """
         states = state_dict["worlds"]
         if (state_dict["task"], len(states)) != (self.task, len(self.worlds)):
@@ -222,20 +222,20 @@ class ControlSuiteEnv(EnvBase):
 
 
 class SuiteWorld:
-    """One task of the suite with its camera, and what it takes to bring it back to where it is.
+    """One task of the suite with its camera, whose state can be saved and restored.
 
     Args:
         task: a name of `TASKS`.
-        seed: of the task's model and episodes.
+        seed: seed of the task's model and episodes.
         camera: number or name of the camera; None for no images.
         image_size: width and height of the images.
-        limit: simulator steps after which an episode is truncated, where that is sooner than the task's time limit.
+        limit: simulator steps after which an episode is truncated, if before the task's time limit; None for no limit.
 
     Attributes:
         action_size: A.
         vector_size: V.
         terminated: whether the last step ended the episode with discount 0.
-        truncated: whether it ended the episode at the time limit.
+        truncated: whether the last step ended the episode at a limit.
 
     Raises:
         ValueError: unknown camera.
@@ -255,7 +255,7 @@ class SuiteWorld:
         self.action_size = action.shape[0]
         self.vector_size = sum(math.prod(spec.shape) for spec in self.env.observation_spec().values())
         limited = np.maximum(abs(action.minimum), abs(action.maximum)) < mujoco_bindings.mjMAXVAL
-        # an actuator without limits takes the action as it is
+        # an actuator without limits takes the action unscaled
         self._low, self._high = np.where(limited, action.minimum, -1.0), np.where(limited, action.maximum, 1.0)
         self._camera = None if camera is None else self._make_camera(task, camera, image_size)
 
@@ -271,7 +271,7 @@ class SuiteWorld:
         self._begun, self.terminated, self.truncated = True, False, False
 
     def step(self, action: np.ndarray, repeat: int) -> float:
-        """Take an action (A,) for some simulator steps, fewer if the episode ends; return the sum of their rewards.
+        """Repeat an action (A,) for ``repeat`` simulator steps or until the episode ends; return the summed reward.
 
         Raises:
             RuntimeError: no episode has begun.
@@ -294,14 +294,14 @@ class SuiteWorld:
         return reward
 
     def observe(self) -> np.ndarray:
-        """The image uint8 (height, width, 3), or without a camera all observations in a row, float32 (V,)."""
+        """Return the image uint8 (height, width, 3), or without a camera all observations as float32 (V,)."""
         if self._camera is not None:
             return np.ascontiguousarray(self._camera.render())
         values = self.env.task.get_observation(self.env.physics).values()
         return np.concatenate([np.ravel(value) for value in values]).astype(np.float32)
 
     def state_dict(self) -> dict[str, Any]:
-        """Seed, random states at the episode's start and now, physics state, step count, ends."""
+        """Return seed, random states at the episode's start and now, physics state, step count and end flags."""
         physics = self.env.physics
         return {
             "seed": self.seed,
@@ -316,10 +316,10 @@ class SuiteWorld:
         }
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        """Bring a new world of the same seed to a saved state.
+        """Restore a saved state in a new world of the same seed.
 
-        Tasks write into the model when an episode begins (targets, terrain): the episode is begun again from the same
-        random numbers, then moved to where it was.
+        Tasks write into the model when an episode begins (targets, terrain), so the episode is first begun again with
+        the same random numbers.
         """
         if not state["begun"]:
             return
@@ -327,8 +327,8 @@ class SuiteWorld:
         self.reset()
         physics = self.env.physics
         physics.set_state(state["physics"].numpy(), PHYSICS_STATE)
-        mujoco_bindings.mj_step1(physics.model.ptr, physics.data.ptr)  # what follows from positions and velocities
-        physics.data.sensordata[:] = state["sensors"].numpy()  # those of forces follow from the step before
+        mujoco_bindings.mj_step1(physics.model.ptr, physics.data.ptr)  # for all that follows from qpos and qvel
+        physics.data.sensordata[:] = state["sensors"].numpy()  # force sensors depend on the previous step
         self._set_random_state(state["random"])
         self.terminated, self.truncated = state["terminated"], state["truncated"]
         self.env._step_count, self.env._reset_next_step = state["step_count"], self.ended
@@ -346,7 +346,7 @@ class SuiteWorld:
         if camera not in names and camera not in range(model.ncam):
             raise ValueError(f"camera={camera!r}: {task} has the cameras 0 to {model.ncam - 1}, {', '.join(names)}.")
         view = model.vis.global_
-        view.offwidth = view.offheight = image_size  # the same image as from a larger buffer, sooner
+        view.offwidth = view.offheight = image_size  # the same image as from a larger buffer, but faster
         for name, per_pixel in DETAIL.items():
             enough = int(per_pixel * max(image_size, 64))
             setattr(model.vis.quality, name, min(enough, getattr(model.vis.quality, name)))
@@ -364,7 +364,7 @@ class SuiteWorld:
 
 
 def _check_arguments(task: str, action_repeat: int, counts: Mapping[str, Any]) -> None:
-    """Refuse an unknown task, and counts, by name, of nothing or that are no whole numbers."""
+    """Refuse an unknown task, and counts (by name) that are not positive whole numbers."""
     if task not in TASKS:
         close = difflib.get_close_matches(task, TASKS, n=3)
         hint = f"did you mean {' or '.join(close)}? " if close else ""

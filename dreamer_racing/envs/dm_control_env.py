@@ -10,11 +10,11 @@ Physics, rules, rewards and start poses are those of the batched environments, f
 | `body_rates` | (3,) | rad/s, body frame |
 | `target_gate` | (1,) int64 | the gate to pass next |
 | `imu` | (6,) | body rates, rad/s, and specific force, m/s², body frame, only with `imu=` |
-| `vector` | (V,) | numbers of your own, only with `vector=` |
+| `vector` | (V,) | user-defined, only with `vector=` |
 | `pixels` | (height, width, 3) uint8 | nose camera, 64 × 64 by default, only with `from_pixels=True` |
 
-A crash ends the episode with discount 0; the time limit (and the last lap in evaluation) with discount 1. A broken
-physics state or an action that is not finite is a crash too, never an exception.
+A crash ends the episode with discount 0; the time limit (and the last lap in evaluation) with discount 1. A non-finite
+physics state or action is a crash too, never an exception.
 
 Shapes: P physics steps per control step. SI units.
 """
@@ -65,10 +65,10 @@ from dreamer_racing.envs.tracks import Track, load_track
 from dreamer_racing.envs.worlds import ACTION_SIZE
 from dreamer_racing.settings import check_flags, check_numbers, without_none
 
-FRAMEBUFFER = (1280, 960)  # width and height of the largest image that `physics.render` can make
+FRAMEBUFFER = (1280, 960)  # width and height of the largest image that `physics.render` can return
 
 
-MOST_STEPS = 2**31 - 1  # of an episode without a limit: a year and more
+MOST_STEPS = 2**31 - 1  # of an episode without a time limit: more than a year
 
 
 def load(
@@ -93,23 +93,23 @@ def load(
     Args:
         track: name of a built-in track, path to a YAML file, or a `Track`.
         preset: physics preset (`easy`, `faithful`, `betaflight`) or parameters.
-        random: seed or state of start poses and physics randomisation; None for a random seed.
-        time_limit: duration after which an episode is truncated, s; if None 20, in evaluation 30.
+        random: seed or `RandomState` of start poses and physics randomisation; None for a random seed.
+        time_limit: duration after which an episode is truncated, s; None for 20, in evaluation 30.
         evaluation: start at the start pose, at rest, without noise, and finish after the track's laps.
         from_pixels: whether there is an observation `pixels`; needs OpenGL (EGL, OSMesa or a display).
         camera: the nose camera.
-        weights: of the reward, paper Eq. 1.
-        control_rate: actions a second, Hz; if None the preset's, 50.
-        camera_rate: frames a second, Hz, `control_rate` divided by a whole number: an image is shown until the next
-            one; if None the camera's, a frame at every control step.
-        imu: whether there is an observation `imu`: `exact`, `noisy` (see `IMUS`), or by how much it errs.
-        reward: function of a `Transition` in place of Eq. 1, or `module:function`, as of `RaceWorlds`.
-        vector: function of a `RaceState` whose numbers are an observation `vector`, likewise.
+        weights: reward weights of Eq. 1 of the paper.
+        control_rate: actions per second, Hz; None for the preset's, 50.
+        camera_rate: frames per second, Hz: `control_rate` divided by a whole number. The image is repeated until the
+            next frame; None for the camera's rate, by default a frame per control step.
+        imu: IMU of the observation `imu`: `exact`, `noisy` (see `IMUS`), or an error model; None for none.
+        reward: function of a `Transition` in place of Eq. 1, or `module:function`; see `RaceWorlds`.
+        vector: function of a `RaceState` that returns the observation `vector`, or `module:function`; None for none.
         environment_kwargs: further arguments of `control.Environment`, e.g. `flat_observation`.
 
     Raises:
-        ValueError: bad argument; the message says which and what is allowed.
-        TrackError: unknown or broken track.
+        ValueError: invalid argument; the message says which and what is allowed.
+        TrackError: unknown or invalid track.
 
     Example:
         >>> env = load("circle", random=0)
@@ -140,12 +140,12 @@ def load(
         reward=reward,
         vector=vector,
     )
-    # no time_limit here: control.Environment would give a crash in the last step the discount of a truncation
+    # no time_limit here: control.Environment would give a crash in the last step discount 1, as of a truncation
     return control.Environment(physics, task, control_timestep=parameters.control_dt, **(environment_kwargs or {}))
 
 
 def _steps_of(time_limit: float, control_dt: float) -> int:
-    """Return the control steps of an episode, all that there can be for an infinite one; refuse one without any."""
+    """Return the control steps of an episode, `MOST_STEPS` for an infinite limit; refuse a limit below one step."""
     if math.isnan(time_limit):
         raise ValueError("time_limit=nan: must be a number, or inf for no limit.")
     episode_steps = round(min(time_limit / control_dt, float(MOST_STEPS)))
@@ -162,7 +162,7 @@ def make_physics(
 ) -> "Physics":
     """Compile the scene of a track for one drone, whose physics randomisation is drawn from the generator.
 
-    A second camera, `spectator`, stands in a corner of the hall and follows the drone with its gaze.
+    A second camera, `spectator`, stands in a corner of the hall and is always aimed at the drone.
     """
     spec = build_scene(track, parameters, camera)
     spec.worldbody.add_camera(
@@ -175,20 +175,20 @@ def make_physics(
     view = spec.visual.global_
     view.offwidth, view.offheight = max(FRAMEBUFFER[0], view.offwidth), max(FRAMEBUFFER[1], view.offheight)
     model = spec.compile()
-    # a broken state must be seen and ended by the race, not hidden by an automatic reset
+    # the race must detect a non-finite state and end the episode; an automatic reset would hide it
     model.opt.disableflags |= mujoco_bindings.mjtDisableBit.mjDSBL_AUTORESET
     quadrotor = Quadrotor(parameters, num_drones=1, generator=generator)
     return Physics(wrapper.MjData(wrapper.MjModel(model)), quadrotor)
 
 
 class Physics(mujoco.Physics):
-    """One drone in its hall.
+    """Physics of one drone in its hall.
 
-    Its flight controller and motors run in every physics step. What they remember (rotor speeds, commands under way)
-    lives in `quadrotor`, outside MuJoCo's own state: `get_state` does not carry it, and copies and pickles are refused.
+    Its flight controller and motors run in every physics step. Their state (rotor speeds, delayed commands) is in
+    `quadrotor`, outside MuJoCo's state: `get_state` does not include it, and copying and pickling are refused.
 
     Args:
-        data: the simulation of a scene of `build_scene`.
+        data: the simulation of a scene made by `build_scene`.
         quadrotor: the drone's flight controller and motors, N = 1.
     """
 
@@ -201,7 +201,7 @@ class Physics(mujoco.Physics):
         self._start_path()
 
     def copy(self, share_model: bool = False) -> "Physics":
-        """Refuse, as with `copy.deepcopy` and pickling: the copy would have no flight controller, or share this one's.
+        """Refuse to be copied: the copy would have no flight controller, or share this one's.
 
         Raises:
             TypeError: always; the message says what to do instead.
@@ -232,7 +232,7 @@ class Physics(mujoco.Physics):
         return self.data.qvel[3:6].copy()
 
     def feel(self) -> Tensor:
-        """What an IMU in its centre shows, (1, 6), as `Simulator.feel`."""
+        """Return what an ideal IMU at the drone's centre measures, (1, 6), as `Simulator.feel`."""
         rates, attitude, velocity = (
             torch.from_numpy(part()) for part in (self.body_rates, self.attitude, self.linear_velocity)
         )
@@ -245,7 +245,7 @@ class Physics(mujoco.Physics):
         return torch.from_numpy(np.stack(self._path)).unsqueeze(1)
 
     def place(self, position: np.ndarray, attitude: np.ndarray, linear_velocity: np.ndarray) -> None:
-        """Put the drone there, (3,), (4,) and (3,), not rotating, with its rotors at hover and new parameters."""
+        """Set position (3,), attitude (4,) and velocity (3,), with no rotation, hovering rotors and new parameters."""
         self.data.qpos[:3], self.data.qpos[3:7] = position, attitude
         self.data.qvel[:3], self.data.qvel[3:6] = linear_velocity, 0.0
         self._flight.qvel_before.copy_(torch.from_numpy(self.data.qvel))
@@ -253,17 +253,17 @@ class Physics(mujoco.Physics):
         self._start_path()
 
     def command(self, action: np.ndarray) -> None:
-        """Take the finite action (4,) in [-1, 1] of the coming control step: collective thrust and body rates."""
+        """Set the finite action (4,) in [-1, 1] of the next control step: collective thrust and body rates."""
         self.quadrotor.command(torch.from_numpy(action).unsqueeze(0))
         self._start_path()
 
     def step(self, nstep: int = 1) -> None:
-        """Fly this many physics steps of the present command; a state that breaks is for the race to see."""
+        """Simulate physics steps with the current command; the race detects a non-finite state."""
         for _ in range(nstep):
             self._flight.step(self._physics_step)
             self._physics_step += 1
             self._path.append(self.position())
-        # cameras and sensors of the new state: mj_step leaves those of the old one
+        # update cameras and sensors to the new state: mj_step leaves those of the old one
         mujoco_bindings.mj_step1(self.model.ptr, self.data.ptr)
 
     def _integrate(self) -> None:
@@ -276,11 +276,11 @@ class Physics(mujoco.Physics):
 
 
 class OnboardView:
-    """The drone's own view, drawn by dm_control's renderer, the drone itself hidden.
+    """The nose camera, rendered by dm_control with the drone itself hidden.
 
     Args:
         physics: the drone and its hall.
-        camera: the nose camera with which the hall was built.
+        camera: the nose camera with which the scene was built.
 
     Raises:
         RendererUnavailableError: dm_control has no OpenGL that works here.
@@ -293,31 +293,31 @@ class OnboardView:
         self._camera.option.sitegroup[:] = 0
 
     def image(self) -> np.ndarray:
-        """What the drone sees now, uint8 (height, width, 3)."""
+        """Return the current image, uint8 (height, width, 3)."""
         return np.array(self._camera.render())
 
 
 class DroneRace(base.Task):
-    """One drone racing: the rules of `Race` and the reward of Eq. 1, suite style.
+    """One drone racing as a Control Suite task: the rules of `Race` and the reward of Eq. 1.
 
-    Every episode's draws come from a torch generator that is seeded with one number from `task.random`.
+    For every episode, the torch generator is seeded with a number drawn from `task.random`.
 
     Args:
         track: the track.
         parameters: the drone.
-        generator: the source of physics randomisation that `Physics` draws from; its own if None.
+        generator: the generator from which `Physics` draws its randomisation; a new one if None.
         random: seed or `numpy.random.RandomState`.
-        episode_steps: control steps after which an episode is truncated; None for those of 20 s.
+        episode_steps: control steps after which an episode is truncated; None for 20 s.
         evaluation: start at the start pose, at rest, and finish after the track's laps.
         camera: the nose camera; None for no `pixels`.
-        imu: by how much the IMU errs; None for no `imu`.
-        weights: of the reward, paper Eq. 1.
+        imu: error model of the IMU; None for no `imu`.
+        weights: reward weights of Eq. 1 of the paper.
         reward: function of a `Transition` in place of Eq. 1, or `module:function`.
-        vector: function of a `RaceState` whose numbers are an observation `vector`; None for none.
+        vector: function of a `RaceState` that returns the observation `vector`; None for none.
 
     Attributes:
         body_rate_weight: b₂ of paper Eq. 1, applied to rewards from now on.
-        outcome: what the last control step did, None before the first.
+        outcome: outcome of the last control step, None before the first.
     """
 
     def __init__(
@@ -349,21 +349,21 @@ class DroneRace(base.Task):
         self._own_reward = None if reward is None else OwnFunction("reward", reward, 1, cpu)
         self._own_vector = None if vector is None else OwnFunction("vector", vector, 1, cpu)
         self._states = RaceStates(self.race, RaceVector(track))
-        self._action = torch.zeros(1, ACTION_SIZE)  # that was flown last
-        self._before: RaceState | None = None  # the present step
+        self._action = torch.zeros(1, ACTION_SIZE)  # last applied action
+        self._before: RaceState | None = None  # state before the current step
         self._imu_errors = imu
         self._imu: Imu | None = None
         self._camera = camera
         self._view: OnboardView | None = None
         self._frame_interval = 1 if camera is None else frame_interval(camera, 1.0 / parameters.control_dt)
-        self._image, self._image_age = np.empty(0), 0  # what is shown, and for how many control steps it has been
+        self._image, self._image_age = np.empty(0), 0  # held image, and its age in control steps
 
     def action_spec(self, physics: Physics) -> specs.BoundedArray:
-        """Collective thrust and body rates x, y, z, (4,) in [-1, 1]."""
+        """Return the spec of collective thrust and body rates x, y, z, (4,) in [-1, 1]."""
         return specs.BoundedArray((ACTION_SIZE,), np.float32, -1.0, 1.0, name="action")
 
     def initialize_episode(self, physics: Physics) -> None:
-        """Begin an episode; base.Task's method would only paint the reward, which is not for an episode's start."""
+        """Begin an episode; base.Task's method is not called, as it only visualises the reward."""
         self._generator.manual_seed(int(self.random.randint(2**31)))
         start = self._starts.sample(1, self.evaluation)
         physics.place(start.position[0].numpy(), start.attitude[0].numpy(), start.linear_velocity[0].numpy())
@@ -376,10 +376,10 @@ class DroneRace(base.Task):
             self._imu.begin(torch.ones(1, dtype=torch.bool))
 
     def before_step(self, action: np.ndarray, physics: Physics) -> None:
-        """Give the action (4,) to the flight controller; what lies beyond [-1, 1] is clipped.
+        """Pass the action (4,) to the flight controller; values beyond [-1, 1] are clipped.
 
         Raises:
-            TypeError: not of a floating-point type.
+            TypeError: the action is not of a floating-point type.
             ValueError: wrong shape.
         """
         action = np.asarray(action)
@@ -398,7 +398,7 @@ class DroneRace(base.Task):
         physics.command(flown)
 
     def after_step(self, physics: Physics) -> None:
-        """Judge the control step."""
+        """Apply the race rules to the control step."""
         self._image_age += 1
         if self._imu is not None:
             self._imu.step()
@@ -409,7 +409,7 @@ class DroneRace(base.Task):
             self.outcome = replace(self.outcome, reward_base=self._own_reward.rewards(transition))
 
     def _race_state(self, physics: Physics) -> RaceState:
-        """Tell how the race stands, for functions of one's own."""
+        """Return the state that user-defined functions are given."""
         parts = (physics.position, physics.attitude, physics.linear_velocity, physics.body_rates)
         return self._states(DroneState(*(torch.from_numpy(part()).unsqueeze(0) for part in parts)), self._action)
 
@@ -431,7 +431,7 @@ class DroneRace(base.Task):
         return observation
 
     def _look(self, physics: Physics) -> np.ndarray:
-        """Return the image that is shown; take a frame where one is due."""
+        """Return the held image, after taking a new frame if one is due."""
         assert self._camera is not None, "asked"
         self._view = self._view or OnboardView(physics, self._camera)
         if self._frame_interval == 1 or self._image_age >= self._frame_interval:
@@ -439,12 +439,12 @@ class DroneRace(base.Task):
         return self._image.copy()
 
     def get_reward(self, physics: Physics) -> float:
-        """Eq. 1 with today's b₂."""
+        """Return the reward of Eq. 1 with the current b₂."""
         assert self.outcome is not None, "there is no reward before the first step"
         return self.outcome.reward(self.body_rate_weight).item()
 
     def get_termination(self, physics: Physics) -> float | None:
-        """Discount of the episode's end: 0 after a crash, 1 out of time or finished; None while it goes on."""
+        """Return the final discount: 0 after a crash, 1 if out of time or finished; None while the episode goes on."""
         assert self.outcome is not None, "there is no end before the first step"
         if self.outcome.terminated.item():
             return 0.0

@@ -1,4 +1,4 @@
-"""dm_control's OpenGL. It is chosen as dm_control is imported, so whoever draws with that imports this before it."""
+"""Choice of dm_control's OpenGL backend. dm_control fixes it on import, so import this module before dm_control."""
 
 import os
 import sys
@@ -10,10 +10,10 @@ RENDERING = "dm_control._render"
 
 
 def choose_backend() -> None:
-    """Without a display, point dm_control to a headless OpenGL library before it settles for a windowing one.
+    """Set `MUJOCO_GL` to a headless OpenGL library if there is no display.
 
-    dm_control decides when it is imported, and takes GLFW even where GLFW cannot open a window. A `MUJOCO_GL` that
-    is set already is left alone.
+    dm_control decides on import, and takes GLFW even if GLFW cannot open a window. A `MUJOCO_GL` that is already set
+    is not changed.
     """
     if os.environ.get("MUJOCO_GL") or not sys.platform.startswith("linux"):
         return
@@ -24,8 +24,8 @@ def choose_backend() -> None:
 
 
 def import_dm_control() -> None:
-    """Import dm_control with the OpenGL that the user names, else with one that is there, else without any."""
-    for _ in range(3):  # what the user set, without one of two variables, and one of those that are there
+    """Import dm_control with the OpenGL backend set by the user, else with an available one, else without any."""
+    for _ in range(3):  # the user's variables, then one of the two unset, then an available backend
         choose_backend()
         if imports_with_variable(RENDERING):
             return
@@ -34,19 +34,19 @@ def import_dm_control() -> None:
 
 import_dm_control()
 
-from dm_control import _render, mujoco  # noqa: E402 - after the choice
+from dm_control import _render, mujoco  # noqa: E402 - after the choice of backend
 
 BACKEND: str | None = _render.BACKEND
-"""What dm_control settled for; None: nothing that draws."""
+"""The OpenGL backend that dm_control chose; None if it cannot render."""
 
 
 def open_camera(physics: mujoco.Physics, height: int, width: int, camera: int | str) -> mujoco.Camera:
-    """Make a camera that draws.
+    """Make a camera that renders images.
 
     Args:
-        physics: what it sees.
-        height: of its images, pixels.
-        width: likewise.
+        physics: the simulation to render.
+        height: image height, pixels.
+        width: image width, pixels.
         camera: number or name in the model.
 
     Raises:
@@ -54,7 +54,7 @@ def open_camera(physics: mujoco.Physics, height: int, width: int, camera: int | 
     """
     try:
         return mujoco.Camera(physics, height, width, camera)
-    except Exception as error:  # GLFW, PyOpenGL and MuJoCo each raise their own
+    except Exception as error:  # GLFW, PyOpenGL and MuJoCo each raise their own types
         raise RendererUnavailableError(
             f"dm_control cannot draw with {BACKEND or 'no OpenGL library'}, which it chose when it was "
             f"imported ({type(error).__name__}: {error}). Without a display it needs EGL (Debian: apt-get install "

@@ -1,7 +1,7 @@
-"""`MUJOCO_GL` and what else MuJoCo, dm_control and PyOpenGL read when they are imported, and fail by.
+"""OpenGL environment variables with which the import of MuJoCo, dm_control or PyOpenGL can fail, such as `MUJOCO_GL`.
 
-Physics needs no OpenGL, and images can be drawn in several ways: no such variable is a reason to fly nothing. A value
-by which an import fails is left out of account, in this process and those that it starts, and that is said.
+Physics needs no OpenGL and images can be rendered in several ways, so a bad value must not stop the program. A value
+that makes an import fail is unset for this process and its children, with a warning.
 """
 
 from __future__ import annotations
@@ -16,22 +16,22 @@ logger = logging.getLogger(__name__)
 VARIABLES = ("MUJOCO_GL", "PYOPENGL_PLATFORM", "MUJOCO_EGL_DEVICE_ID")
 
 refused: dict[str, str] = {}
-"""What was left out of account, `NAME=value`, and why."""
+"""Settings that were unset, as `NAME=value`, and the reason for each."""
 
 
 def imports_with_variable(name: str) -> bool:
-    """Import a package that reads `MUJOCO_GL`; if that fails, take the variable that is in the way away and say so.
+    """Import a package that reads `MUJOCO_GL` and return True; if that fails, unset the variable, warn, return False.
 
-    That is `PYOPENGL_PLATFORM` where the error names it, as MuJoCo's and dm_control's do if it is another platform.
+    The variable is `PYOPENGL_PLATFORM` if the error names it, as those of MuJoCo and dm_control do on a mismatch.
 
     Raises:
-        Exception: what the package raises, where `MUJOCO_GL` is not set.
+        Exception: the package's own error, if `MUJOCO_GL` is not set.
     """
     value, platform = os.environ.get("MUJOCO_GL"), os.environ.get("PYOPENGL_PLATFORM")
     loaded = set(sys.modules)
     try:
         importlib.import_module(name)
-    except Exception as error:  # RuntimeError for a wrong word, ImportError, and AttributeError of PyOpenGL's
+    except Exception as error:  # RuntimeError for an unknown value, ImportError, PyOpenGL's AttributeError
         if value is None:
             raise
         reason = f"{type(error).__name__}: {error}"
@@ -41,9 +41,9 @@ def imports_with_variable(name: str) -> bool:
     variable, refusal = ("PYOPENGL_PLATFORM", platform) if named else ("MUJOCO_GL", value)
     del os.environ[variable]
     if platform is None:
-        os.environ.pop("PYOPENGL_PLATFORM", None)  # set by what failed
+        os.environ.pop("PYOPENGL_PLATFORM", None)  # set by the failed import
     for module in set(sys.modules) - loaded:
-        if module.partition(".")[0] == "OpenGL":  # is bound to the platform that it was first imported for
+        if module.partition(".")[0] == "OpenGL":  # is bound to the platform of its first import
             del sys.modules[module]
     setting = f"{variable}={refusal}"
     if setting not in refused:
@@ -54,13 +54,13 @@ def imports_with_variable(name: str) -> bool:
 
 
 def heed_variables() -> None:
-    """Import MuJoCo now if `MUJOCO_GL` is set, so that those who import it later are not failed by it."""
+    """Import MuJoCo now if `MUJOCO_GL` is set, so that a bad value cannot break a later import."""
     while "MUJOCO_GL" in os.environ and "mujoco" not in sys.modules:
-        imports_with_variable("mujoco")  # or one variable less is set
+        imports_with_variable("mujoco")  # each failure unsets one variable, so the loop ends
 
 
 def in_the_way(backend: str) -> str:
-    """Name what is set and may keep a back end from starting: ` (PYOPENGL_PLATFORM=glx is set)`, or nothing."""
+    """Name the variables that may keep a backend from starting: ` (PYOPENGL_PLATFORM=glx is set)`, or ""."""
     values = {name: os.environ[name] for name in VARIABLES if os.environ.get(name)}
     named = [f"{name}={value}" for name, value in values.items() if value != backend]
     return f" ({', '.join(named)} {'is' if len(named) == 1 else 'are'} set)" if named else ""

@@ -1,22 +1,22 @@
-"""The race for Gymnasium: `gymnasium.make("dreamer_racing/Kidney-v0")`; many drones at once are in `gym_vector_env`.
+"""The race for Gymnasium: `gymnasium.make("dreamer_racing/Kidney-v0")`; `gym_vector_env` has the vector environment.
 
-Action: `Box(-1, 1, (4,), float32)`: collective thrust, body rates x, y, z. Observation, by the argument `observation`:
+Action: `Box(-1, 1, (4,), float32)`: collective thrust, body rates x, y, z. The argument `observation` chooses:
 
 | `observation` | space |
 |---|---|
 | `"pixels"` | `Box(0, 255, (height, width, 3), uint8)`, the nose camera, 64 × 64 by default |
 | `"pixels_imu"` | `Dict` of `pixels` and `imu`, `Box(-inf, inf, (6,), float32)`: body rates and specific force |
-| `"vector"` | `Box(-inf, inf, (21,), float32)`, see `RaceVector`, or by `vector=` numbers of your own |
+| `"vector"` | `Box(-inf, inf, (21,), float32)`, see `RaceVector`, or user-defined by `vector=` |
 | `"pixels_vector"` | `Dict` of `pixels` and `vector` |
 | `"state"` | `Dict` of `position`, `attitude` (wxyz), `linear_velocity` (world), `body_rates` (body), `target_gate` |
 | `"both"` | the same `Dict` with `pixels` |
 
-`render` draws 256 × 256 pixels (`render_mode="rgb_array"`), by the argument `render_view`: `"chase"`, the drone from
-outside, which needs OpenGL, or `"onboard"`, what it sees itself, larger. All in SI units.
+`render` returns 256 × 256 pixels (`render_mode="rgb_array"`). The argument `render_view` chooses the view: `"chase"`,
+the drone from outside, which needs OpenGL, or `"onboard"`, an enlarged nose camera image. All in SI units.
 
-`info` has `gates_passed`, `gate_offset` m, `lap_time` s, `crash` (the number of a `CrashCause`, 0 while flying),
-`finished`, `reward_base` and `body_rate_norm` rad/s (`reward = reward_base − b₂ · body_rate_norm`), and with
-`privileged=True` a dictionary `privileged` of the state. Zeros after a reset.
+`info` has `gates_passed`, `gate_offset` m, `lap_time` s, `crash` (a `CrashCause`, 0 while flying), `finished`,
+`reward_base` and `body_rate_norm` rad/s (`reward = reward_base − b₂ · body_rate_norm`), which are zero after a reset,
+and with `privileged=True` a dictionary `privileged` of the state.
 
 Importing `dreamer_racing` registers the environments; `gymnasium.make("dreamer_racing:dreamer_racing/Kidney-v0")` does
 both. Shapes: N environments.
@@ -50,7 +50,7 @@ Observation = np.ndarray | dict[str, np.ndarray]
 
 
 def row_of(batch: Any, index: int) -> Any:
-    """One environment's part of observations or `info` of N, with NumPy's scalars as Python's."""
+    """Return one environment's row of batched observations or `info`, with NumPy scalars as Python's."""
     if isinstance(batch, dict):
         return {name: row_of(value, index) for name, value in batch.items()}
     row = batch[index]
@@ -58,7 +58,7 @@ def row_of(batch: Any, index: int) -> Any:
 
 
 def rows_of(batch: dict[str, Any]) -> list[dict[str, Any]]:
-    """`row_of` every environment, column by column."""
+    """Return `row_of` of every environment; faster, as it converts column by column."""
     columns = [
         rows_of(value) if isinstance(value, dict) else value.tolist() if value.ndim == 1 else list(value)
         for value in batch.values()
@@ -67,7 +67,7 @@ def rows_of(batch: dict[str, Any]) -> list[dict[str, Any]]:
 
 
 def with_rows(batch: Observation, mask: np.ndarray, rows: Observation) -> Observation:
-    """Observations of N environments with other ones in M rows, those masked (N,) bool; the batch stays as it was."""
+    """Return a copy of the observations of N environments with the masked (N,) bool rows replaced by M new ones."""
     if isinstance(batch, dict):
         assert isinstance(rows, dict)
         return {name: _merged(batch[name], mask, rows[name]) for name in batch}
@@ -76,13 +76,13 @@ def with_rows(batch: Observation, mask: np.ndarray, rows: Observation) -> Observ
 
 
 def _merged(batch: np.ndarray, mask: np.ndarray, rows: np.ndarray) -> np.ndarray:
-    merged = batch.copy()  # last observations of episodes are views of the batch
+    merged = batch.copy()  # final observations of episodes are views of the batch
     merged[mask] = rows
     return merged
 
 
 class GymWorlds:
-    """What the single and the vector environments share: N worlds in Gymnasium's terms, always batched.
+    """N worlds with Gymnasium's spaces and `info`, always batched: shared by the single and the vector environments.
 
     Args:
         track: name of a built-in track, path to a YAML file, or a `Track`.
@@ -92,12 +92,12 @@ class GymWorlds:
         body_rate_weight: b₂ of paper Eq. 1; that of `RewardWeights` if None.
         render_mode: `rgb_array` or None.
         preset: physics preset or parameters.
-        render_view: of frames: `chase` or `onboard`.
+        render_view: view of rendered frames: `chase` or `onboard`.
         worlds: further arguments of `RaceWorlds`, see `WorldOptions`.
 
     Raises:
-        ValueError: bad argument; the message says which and what is allowed.
-        TrackError: unknown or broken track.
+        ValueError: invalid argument; the message says which and what is allowed.
+        TrackError: unknown or invalid track.
     """
 
     def __init__(
@@ -122,7 +122,7 @@ class GymWorlds:
         if body_rate_weight is not None:
             check_setting("body_rate_weight", body_rate_weight, FINITE)
         device = worlds.get("device", "cpu")
-        if str(device).partition(":")[0] == "cuda":  # others are for the worlds to refuse
+        if str(device).partition(":")[0] == "cuda":  # RaceWorlds refuses other devices
             raise ValueError(
                 f"device={device!r}: Gymnasium's arrays live on cpu; DroneRacingEnv keeps tensors on a GPU."
             )
@@ -148,7 +148,7 @@ class GymWorlds:
 
     @property
     def frames_per_second(self) -> int:
-        """Of a video in real time: control steps a second."""
+        """Frame rate of a real-time video: control steps per second."""
         return round(1.0 / self.worlds.parameters.control_dt)
 
     def action_space(self) -> Box:
@@ -176,10 +176,10 @@ class GymWorlds:
         return Dict(spaces if self.observation == "state" else {"pixels": pixels, **spaces})
 
     def begin(self, mask: np.ndarray | None = None) -> None:
-        """Begin episodes everywhere, or where masked (N,) bool.
+        """Begin episodes in all environments, or in the masked ones (N,) bool.
 
         Raises:
-            ResetNeeded: masked, but no episode has begun yet: the other drones would fly from nowhere.
+            ResetNeeded: a mask was given before the first reset of all environments.
         """
         if mask is not None and not self.worlds.begun:
             raise gymnasium.error.ResetNeeded(
@@ -189,11 +189,11 @@ class GymWorlds:
         self.worlds.reset(None if mask is None else torch.from_numpy(mask))
 
     def step(self, actions: Any) -> tuple[RaceStep, np.ndarray]:
-        """Fly one control step; return what it did and the rewards (N,).
+        """Simulate one control step; return its outcome and the rewards (N,).
 
         Raises:
             ResetNeeded: no episode has begun.
-            TypeError, ValueError: actions of another type or shape.
+            TypeError, ValueError: actions of a wrong type or shape.
         """
         if not self.worlds.begun:
             raise gymnasium.error.ResetNeeded("step() before the first reset(): no episode has begun.")
@@ -204,7 +204,7 @@ class GymWorlds:
         return outcome, outcome.reward(self.body_rate_weight).numpy()
 
     def observe(self, mask: np.ndarray | None = None) -> Observation:
-        """The observations of all environments, or of the M masked ones (N,) bool in order."""
+        """Return the observations of all environments, or of the M masked ones (N,) bool in order."""
         rows = slice(None) if mask is None else mask
         if self.observation == "vector":
             return self.worlds.observed_vector().numpy()[rows]
@@ -220,12 +220,12 @@ class GymWorlds:
         return pixels if self.observation == "pixels" else {"pixels": pixels, **state}
 
     def state(self) -> dict[str, np.ndarray]:
-        """The privileged state of all environments; `target_gate` is (N,)."""
+        """Return the privileged state of all environments; `target_gate` is (N,)."""
         state = {name: value.numpy() for name, value in self.worlds.privileged().items()}
         return {**state, "target_gate": state["target_gate"][:, 0]}
 
     def info(self, outcome: RaceStep | None, begun: np.ndarray | None = None) -> dict[str, Any]:
-        """What happened in the race, arrays (N,); zeros where an episode has begun (N,) bool, or without outcome."""
+        """Return `info` as arrays (N,); zeros where an episode has begun (N,) bool, or if there is no outcome."""
         num_envs = self.worlds.num_envs
 
         def values(name: str, kind: type) -> np.ndarray:
@@ -246,18 +246,18 @@ class GymWorlds:
         return info
 
     def frames(self) -> np.ndarray:
-        """Draw every drone from outside, or what it sees, uint8 (N, 256, 256, 3), by a renderer made on first use.
+        """Render the chase or onboard view of every drone, uint8 (N, 256, 256, 3), by a renderer made on first use.
 
         Raises:
             ClosedEnvironmentError: the environment is closed.
-            RendererUnavailableError: drones are to be drawn from outside, and there is no OpenGL.
+            RendererUnavailableError: the chase view is chosen and there is no OpenGL.
         """
         if self._closed:
             raise gymnasium.error.ClosedEnvironmentError("render() after close(): there is nothing left to draw with.")
         return self._seen_from_outside() if self._render_view == "chase" else self._seen_on_board()
 
     def _seen_from_outside(self) -> np.ndarray:
-        """Return the drones as cameras behind them see them, in nominal colours."""
+        """Render the drones from chase cameras, in nominal colours."""
         worlds = self.worlds
         if self._chase is None:
             try:
@@ -275,7 +275,7 @@ class GymWorlds:
         )
 
     def _seen_on_board(self) -> np.ndarray:
-        """Return what each drone sees, but for noise."""
+        """Render the nose camera of each drone, without camera noise."""
         worlds, looks = self.worlds, self.worlds.simulator.looks
         if self._onboard is None:
             camera = replace(worlds.camera, width=FRAME_SIZE, height=FRAME_SIZE)
@@ -299,8 +299,8 @@ class GymWorlds:
 class DroneRaceGymEnv(gymnasium.Env[Observation, np.ndarray]):
     """One drone on one track; spaces and `info` are in the module's tables.
 
-    The episode ends by itself after `episode_steps` (truncated). `gymnasium.make(..., max_episode_steps=...)` can make
-    it shorter, but not longer: for that, pass `episode_steps`.
+    The episode is truncated after `episode_steps`. `gymnasium.make(..., max_episode_steps=...)` can only make it
+    shorter; to make it longer, pass `episode_steps`.
 
     Args:
         track: name of a built-in track, path to a YAML file, or a `Track`.
@@ -309,12 +309,12 @@ class DroneRaceGymEnv(gymnasium.Env[Observation, np.ndarray]):
         privileged: whether `info` has the state.
         body_rate_weight: b₂ of paper Eq. 1; that of `RewardWeights` if None.
         preset: physics preset (`easy`, `faithful`, `betaflight`) or parameters.
-        render_view: of frames: `chase`, the drone from outside, or `onboard`, what it sees.
+        render_view: view of rendered frames: `chase`, the drone from outside, or `onboard`, its nose camera.
         worlds: further arguments of `RaceWorlds`; see `WorldOptions`.
 
     Raises:
-        ValueError: bad argument; the message says which and what is allowed.
-        TrackError: unknown or broken track.
+        ValueError: invalid argument; the message says which and what is allowed.
+        TrackError: unknown or invalid track.
 
     Example:
         >>> env = gymnasium.make("dreamer_racing/Kidney-v0", observation="state")
@@ -349,7 +349,7 @@ class DroneRaceGymEnv(gymnasium.Env[Observation, np.ndarray]):
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Observation, dict[str, Any]]:
-        """Begin an episode; a seed makes it and those after it reproducible. There are no options."""
+        """Begin an episode; a seed makes this and all later episodes reproducible. `options` is ignored."""
         super().reset(seed=seed)
         if seed is not None:
             self.race.worlds.seed(seed)
@@ -357,14 +357,14 @@ class DroneRaceGymEnv(gymnasium.Env[Observation, np.ndarray]):
         return row_of(self.race.observe(), 0), row_of(self.race.info(None), 0)
 
     def step(self, action: np.ndarray) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
-        """Fly one control step.
+        """Simulate one control step.
 
         Args:
-            action: (4,); values beyond [-1, 1] are clipped, and one that is not finite is a crash.
+            action: (4,); values beyond [-1, 1] are clipped, a non-finite value is a crash.
 
         Raises:
             ResetNeeded: no episode has begun.
-            TypeError, ValueError: an action of another type or shape.
+            TypeError, ValueError: an action of a wrong type or shape.
         """
         if np.shape(action) != (ACTION_SIZE,):
             raise ValueError(
@@ -381,7 +381,7 @@ class DroneRaceGymEnv(gymnasium.Env[Observation, np.ndarray]):
         )
 
     def render(self) -> np.ndarray | None:
-        """The drone from outside, or what it sees, uint8 (256, 256, 3); None without a render mode."""
+        """Return the chase or onboard view, uint8 (256, 256, 3); None without a render mode."""
         return self.race.frames()[0] if self.render_mode == "rgb_array" else None
 
     def close(self) -> None:

@@ -18,15 +18,15 @@ from dreamer_racing.settings import check_numbers, without_none
 
 
 class DroneRaceVectorEnv(VectorEnv[Observation, np.ndarray, np.ndarray]):
-    """N drones racing at once in one process, much faster than N single environments.
+    """N drones racing in parallel in one process, much faster than N single environments.
 
-    Episodes begin anew in one of Gymnasium's modes. NEXT_STEP: the step in which an episode ends returns its last
-    observation, and the step after it ignores that environment's action and returns the first observation of the next
-    episode with reward 0. SAME_STEP: the step itself returns the first observation of the next episode, and `info` the
-    last one of the old (`final_obs`, an array of objects, and `final_info`). DISABLED: whoever steps begins them, by
-    `reset(options={"reset_mask": ended})`, as TorchRL's `GymWrapper` does. Every entry of `info` but these two is there
-    for every environment (`info["_" + name]` is all true), of a reset for those that were reset; these two, and all
-    that is in `final_info`, are there for those whose episode ended.
+    Ended episodes are reset in one of Gymnasium's modes. NEXT_STEP: the step in which an episode ends returns its last
+    observation; the next step ignores that environment's action and returns the first observation of the next episode
+    with reward 0. SAME_STEP: the step itself returns the first observation of the next episode, and `info` the last
+    one of the old (`final_obs`, an array of objects, and `final_info`). DISABLED: the caller resets, by
+    `reset(options={"reset_mask": ended})`, as TorchRL's `GymWrapper` does. `final_obs` and `final_info` are present
+    only for environments whose episode ended; all other entries of `info` for every environment
+    (`info["_" + name]` is all true), with the values after the reset where there was one.
 
     Args:
         num_envs: N.
@@ -36,14 +36,14 @@ class DroneRaceVectorEnv(VectorEnv[Observation, np.ndarray, np.ndarray]):
         privileged: whether `info` has the state.
         body_rate_weight: b₂ of paper Eq. 1; that of `RewardWeights` if None.
         preset: physics preset (`easy`, `faithful`, `betaflight`) or parameters.
-        render_view: of frames: `chase`, the drone from outside, or `onboard`, what it sees.
-        max_episode_steps: control steps until an episode is truncated; Gymnasium's name of `episode_steps`.
+        render_view: view of rendered frames: `chase`, the drone from outside, or `onboard`, its nose camera.
+        max_episode_steps: control steps until an episode is truncated; Gymnasium's name for `episode_steps`.
         autoreset_mode: `NextStep`, `SameStep` or `Disabled`.
         worlds: further arguments of `RaceWorlds`; see `WorldOptions`.
 
     Raises:
-        ValueError: bad argument; the message says which and what is allowed.
-        TrackError: unknown or broken track.
+        ValueError: invalid argument; the message says which and what is allowed.
+        TrackError: unknown or invalid track.
 
     Example:
         >>> envs = gymnasium.make_vec("dreamer_racing/Kidney-v0", num_envs=16, observation="state")
@@ -94,15 +94,15 @@ class DroneRaceVectorEnv(VectorEnv[Observation, np.ndarray, np.ndarray]):
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Observation, dict[str, Any]]:
-        """Begin an episode everywhere, or where it is asked for; a seed makes all that follow reproducible.
+        """Begin an episode in all or the masked environments; a seed makes all that follows reproducible.
 
         Args:
-            seed: of all environments together.
-            options: `reset_mask`, (N,) bool: where an episode begins; the others fly on.
+            seed: one seed for all environments.
+            options: `reset_mask`, (N,) bool: environments to reset; the others fly on.
 
         Raises:
-            ResetNeeded: some, and not all, are to begin before the first reset of all.
-            ValueError: the seed is a list, for all environments draw from one generator; or the mask is none.
+            ResetNeeded: a partial reset before the first reset of all environments.
+            ValueError: the seed is a list, but all environments share one generator; or the mask is invalid.
         """
         if seed is not None and not isinstance(seed, int | np.integer):
             raise ValueError(f"seed={seed!r}: one number seeds all {self.num_envs} environments together.")
@@ -115,13 +115,13 @@ class DroneRaceVectorEnv(VectorEnv[Observation, np.ndarray, np.ndarray]):
         return self.race.observe(), self._masked(self.race.info(None), mask)
 
     def step(self, actions: np.ndarray) -> tuple[Observation, np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
-        """Fly one control step, or begin an episode where the last one has ended.
+        """Simulate one control step, or begin the next episode where one has ended.
 
         Args:
-            actions: (N, 4); values beyond [-1, 1] are clipped, and one that is not finite is a crash of its drone.
+            actions: (N, 4); values beyond [-1, 1] are clipped, a non-finite value is a crash of its drone.
 
         Raises:
-            ResetNeeded: in mode DISABLED, an episode has ended and none has begun since.
+            ResetNeeded: in mode DISABLED, an ended episode has not been reset.
             ValueError: wrong shape.
         """
         begun = self._ended
@@ -148,7 +148,7 @@ class DroneRaceVectorEnv(VectorEnv[Observation, np.ndarray, np.ndarray]):
         return observation, np.where(begun, 0.0, reward), terminated, truncated, info
 
     def render(self) -> tuple[np.ndarray, ...] | None:
-        """The drones from outside, or what they see, N images uint8 (256, 256, 3); None without a render mode."""
+        """Return the chase or onboard views, N images uint8 (256, 256, 3); None without a render mode."""
         return tuple(self.race.frames()) if self.render_mode == "rgb_array" else None
 
     def close_extras(self, **kwargs: Any) -> None:
@@ -162,14 +162,14 @@ class DroneRaceVectorEnv(VectorEnv[Observation, np.ndarray, np.ndarray]):
         return mask
 
     def _final(self, observation: Observation, ended: np.ndarray) -> dict[str, np.ndarray]:
-        """Return the last observation of each episode that ended, None elsewhere, as Gymnasium has them."""
+        """Return the last observation of each episode that ended, None elsewhere, in Gymnasium's format."""
         final = np.full(self.num_envs, None, dtype=object)
         for index in ended.nonzero()[0]:
             final[index] = row_of(observation, int(index))
         return {"final_obs": final, "_final_obs": ended}
 
     def _masked(self, info: dict[str, Any], mask: np.ndarray | None = None) -> dict[str, Any]:
-        """Add Gymnasium's masks of which environments an entry is there for: all of them, unless masked (N,) bool."""
+        """Add Gymnasium's masks of the environments that have an entry: all, or those of the mask (N,) bool."""
         there = np.ones(self.num_envs, dtype=bool) if mask is None else mask
         entries = {
             name: self._masked(value, mask) if isinstance(value, dict) else value for name, value in info.items()

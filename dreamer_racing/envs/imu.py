@@ -1,6 +1,6 @@
 """The flight controller's gyro and accelerometer, as an observation beside images.
 
-A sample is float32 (6,): body rates x, y, z in rad/s, then specific force x, y, z in m/s² (0, 0, 9.81 where a drone
+A sample is float32 (6,): body rates x, y, z in rad/s, then specific force x, y, z in m/s² (0, 0, 9.81 if a drone
 stands or hovers level), both in the body frame, FLU. Shapes: N drones.
 """
 
@@ -15,22 +15,22 @@ from dreamer_racing.settings import NOT_NEGATIVE, check_settings, quoted, settin
 
 IMU_SIZE = 6
 GYRO_RANGE = 34.9
-"""rad/s, ±2000 deg/s: what the sensors of flight controllers can tell (TDK InvenSense, ICM-42688-P, data sheet)."""
+"""Range of flight controllers' gyros, rad/s, ±2000 deg/s (TDK InvenSense, ICM-42688-P, data sheet)."""
 ACCELEROMETER_RANGE = 156.9
-"""m/s², ±16 g, likewise."""
+"""Range of their accelerometers, m/s², ±16 g (same data sheet)."""
 
 
 @dataclass(frozen=True)
 class ImuErrors:
-    """By how much an IMU errs. Noise is drawn anew for each sample, biases where an episode begins, each axis alone.
+    """Error model of an IMU: noise is drawn for each sample, biases for each episode, independently for each axis.
 
     Attributes:
         gyro_noise: standard deviation, rad/s.
-        gyro_bias: likewise.
+        gyro_bias: standard deviation, rad/s.
         accelerometer_noise: standard deviation, m/s².
-        accelerometer_bias: likewise.
-        delay: control steps that a sample is old when it is seen: 1 where the flight controller is asked at one step,
-            and its answer is read at the next.
+        accelerometer_bias: standard deviation, m/s².
+        delay: age of a sample when it is observed, control steps: 1 if the flight controller is polled in one step and
+            its answer is read in the next.
 
     Raises:
         ValueError: a number is out of its range.
@@ -48,18 +48,18 @@ class ImuErrors:
 
 IMUS = {
     "exact": ImuErrors(),
-    # Biases: those that RotorS gives its ADIS16448 at turn-on (rotors_simulator, imu_adis16448), the gyro's of what is
-    # left when it has been calibrated at rest. Noise: of a frame that vibrates, after the firmware's filters [choice].
+    # Biases: turn-on biases of the ADIS16448 in RotorS (rotors_simulator, imu_adis16448); the gyro's is what remains
+    # after calibration at rest. Noise: that of a vibrating frame, after the firmware's filters [choice].
     "noisy": ImuErrors(gyro_noise=0.02, gyro_bias=0.0087, accelerometer_noise=0.5, accelerometer_bias=0.196, delay=1),
 }
 """IMUs by name."""
 
 
 def load_imu(imu: str | ImuErrors | None, from_pixels: bool = True) -> ImuErrors | None:
-    """Return the errors of a named IMU, or the given ones; None: there is no IMU.
+    """Return the error model of a named IMU, or the given one; None if there is no IMU.
 
     Raises:
-        ValueError: unknown name, or no images to have it beside.
+        ValueError: unknown name, or the environment has no images.
     """
     if imu is None:
         return None
@@ -73,12 +73,12 @@ def load_imu(imu: str | ImuErrors | None, from_pixels: bool = True) -> ImuErrors
 
 
 class Imu:
-    """N drones' IMUs: a sample of each at every control step.
+    """The IMUs of N drones, sampled once per control step.
 
     Args:
-        errors: by how much they err.
-        feel: returns body rates and specific force (N, 6) of the drones' centres now.
-        generator: of noise and biases, on the device of what is felt.
+        errors: their error model.
+        feel: returns the true body rates and specific force (N, 6) at the drones' centres.
+        generator: source of noise and biases, on the device of those values.
     """
 
     def __init__(self, errors: ImuErrors, feel: Callable[[], Tensor], generator: torch.Generator) -> None:
@@ -96,26 +96,26 @@ class Imu:
 
     @property
     def sample(self) -> Tensor:
-        """What is seen now, a copy, float32 (N, 6)."""
+        """The observed sample, a float32 copy (N, 6)."""
         return self._samples[-1].to(torch.float32, copy=True)
 
     def begin(self, mask: Tensor) -> None:
-        """Draw biases where episodes begin, (N,) bool; no sample there is older than the episode."""
+        """Draw new biases and refill the delay line for the drones whose episode begins, (N,) bool."""
         rows = mask.unsqueeze(-1)
         if self._errors.gyro_bias or self._errors.accelerometer_bias:
             self._bias = torch.where(rows, self._bias_std * self._normal(), self._bias)
         self._samples = torch.where(rows, self._measure(), self._samples)
 
     def step(self) -> None:
-        """Take the sample at a control step's end."""
+        """Take a sample at the end of a control step."""
         self._samples = torch.cat((self._measure().unsqueeze(0), self._samples[:-1]))
 
     def _measure(self) -> Tensor:
-        """Sample (N, 6) what is felt now."""
+        """Return a noisy, biased and clipped measurement (N, 6)."""
         felt = self._feel()
         if self._errors.gyro_noise or self._errors.accelerometer_noise:
             felt = felt + self._noise_std * self._normal()
-        felt = (felt + self._bias).nan_to_num(0.0)  # of a drone whose state broke
+        felt = (felt + self._bias).nan_to_num(0.0)  # a drone's state may be non-finite
         return torch.minimum(torch.maximum(felt, -self._range), self._range)
 
     def _normal(self) -> Tensor:

@@ -1,6 +1,6 @@
-"""Rewards and observations of a user's own: what their functions are given, and what they may return.
+"""User-defined reward and observation functions: their inputs and the checks of their outputs.
 
-``docs/own_rewards.md`` says how to write them. Shapes: N drones. SI units, float32.
+``docs/own_rewards.md`` explains how to write them. Shapes: N drones. SI units, float32.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from dreamer_racing.settings import import_own, quoted
 
 @dataclass(frozen=True)
 class RaceState:
-    """N drones at one time, each with the gate that it has to pass next; a number of a state that broke is 0."""
+    """State of N drones and their target gates at one time; values that are not finite are replaced by 0."""
 
     position: Tensor
     """(N, 3) m, world."""
@@ -31,51 +31,51 @@ class RaceState:
     body_rates: Tensor
     """(N, 3) rad/s, body frame."""
     action: Tensor
-    """(N, 4) the action that was flown last, in [-1, 1]; zeros where an episode begins."""
+    """(N, 4) last applied action, in [-1, 1]; zeros at the start of an episode."""
     gate_position: Tensor
     """(N, 3) centre of the target gate, m, world."""
     gate_direction: Tensor
-    """(N, 3) unit vector in which the target gate is to be passed, world."""
+    """(N, 3) unit vector of the direction in which the target gate must be passed, world."""
     time: Tensor
-    """(N,) s since the episode began."""
+    """(N,) s since the start of the episode."""
     make_race_vector: Callable[[], Tensor] = field(repr=False)
-    """Makes `race_vector`, which few functions read."""
+    """Computes `race_vector` on first access, because few functions read it."""
 
     @cached_property
     def race_vector(self) -> Tensor:
-        """(N, 21) all of this and the gate after the target in the drone's own frame, see `RaceVector`."""
+        """(N, 21) the drone's state, the target gate and the gate after it, in the body frame; see `RaceVector`."""
         return self.make_race_vector()
 
 
 @dataclass(frozen=True)
 class Transition:
-    """One control step of N drones, each for itself: where it led from and to, and what came of it."""
+    """One control step of N drones: the states before and after it, and its outcome."""
 
     before: RaceState
-    """At the start of the step. Its gate is the one that the step could pass."""
+    """State at the start of the step; its gate is the target during the step."""
     after: RaceState
-    """At its end. Its ``action`` is the one of this step; its gate is the next one where one was passed."""
+    """State at the end; its ``action`` is that of this step; its gate is the next one if the step passed a gate."""
     outcome: RaceStep
-    """Passes, crashes and ends, each (N,)."""
+    """Gate passes, crashes and episode ends, each (N,)."""
 
     @property
     def default_reward(self) -> Tensor:
-        """(N,) Eq. 1 of the paper with the environment's weights, but for the penalty of body rates."""
+        """(N,) Eq. 1 of the paper with the environment's weights, without the body-rate penalty."""
         return self.outcome.reward_base
 
 
 RewardFunction: TypeAlias = Callable[[Transition], Tensor]
-"""Returns rewards, (N,) or (N, 1)."""
+"""Function that returns the rewards, (N,) or (N, 1)."""
 VectorFunction: TypeAlias = Callable[[RaceState], Tensor]
-"""Returns what the agent sees under ``vector``, (N, V)."""
+"""Function that returns the observation ``vector``, (N, V)."""
 
 
 class RaceStates:
-    """Tells how N drones' race stands.
+    """Builds the `RaceState` of N drones.
 
     Args:
-        race: Its rules, and where each episode is.
-        vector: Of its track.
+        race: The race rules and the progress of each episode.
+        vector: The race vector of the same track.
     """
 
     def __init__(self, race: Race, vector: RaceVector) -> None:
@@ -84,7 +84,7 @@ class RaceStates:
         self._positions, self._directions = race.track.gate_positions(device), race.track.gate_normals(device)
 
     def __call__(self, state: DroneState, action: Tensor) -> RaceState:
-        """Return copies of the drones' state, with the action (N, 4) that was flown last and the target gate."""
+        """Return copies of the drones' state, with their last applied action (N, 4) and target gate."""
         race = self._race
         whole = DroneState(**{each.name: getattr(state, each.name).nan_to_num(0.0, 0.0, 0.0) for each in fields(state)})
         return RaceState(
@@ -98,18 +98,18 @@ class RaceStates:
 
 
 class OwnFunction:
-    """A function of a user's own, and the checks of what it returns.
+    """A user-defined reward or vector function whose return values are checked.
 
-    On a CUDA device numbers are looked at only when `check` is called: to look at once would let each step wait.
+    On a CUDA device, non-finite values are reported only when `check` is called, to avoid a synchronisation per step.
 
     Args:
-        argument: By which it is given: ``reward`` or ``vector``.
-        given: The function, a class whose objects are called, or ``module:name`` of either.
+        argument: The environment argument it was given as: ``reward`` or ``vector``.
+        given: The function, a class with callable instances, or ``module:name`` of either.
         num_envs: N.
-        device: Where its numbers live.
+        device: Device of its return values.
 
     Raises:
-        ValueError: It is none, or cannot be imported; the message says what it should be.
+        ValueError: ``given`` is not callable or cannot be imported; the message says what it should be.
     """
 
     def __init__(self, argument: str, given: Any, num_envs: int, device: torch.device) -> None:
@@ -124,14 +124,14 @@ class OwnFunction:
         self._broken = torch.zeros((), dtype=torch.bool, device=device)
 
     def rewards(self, transition: Transition) -> Tensor:
-        """Return the rewards of a step, (N,)."""
+        """Return the rewards (N,) of a step."""
         value = self._call(transition)
         if value.shape not in ((self._num_envs,), (self._num_envs, 1)):
             raise self._wrong_shape(value, f"({self._num_envs},) or ({self._num_envs}, 1), a reward for each drone")
         return value.reshape(self._num_envs)
 
     def vector(self, state: RaceState) -> Tensor:
-        """Return what the agents see, (N, V), always of the same V."""
+        """Return the observation (N, V); V must be the same in every call."""
         value = self._call(state)
         size = self._size or "V"
         if value.ndim != 2 or len(value) != self._num_envs or value.shape[1] != (self._size or value.shape[1]):
@@ -140,16 +140,16 @@ class OwnFunction:
         return value
 
     def check(self) -> None:
-        """Refuse numbers returned since the last check that are not finite; on a CUDA device it waits."""
+        """Raise if values returned since the last check were not finite; synchronises with a CUDA device."""
         if self._broken:
             self._broken.zero_()
             raise ValueError(f"{self.name} returned numbers that are not finite.")
 
     def _call(self, moment: Transition | RaceState) -> Tensor:
-        """Return the function's numbers, float32."""
+        """Return the function's value as float32."""
         try:
             value = self._function(moment)
-        except ValueError as error:  # of the function itself: whoever wrote it wants to see where
+        except ValueError as error:  # raised in the user's function: keep its traceback
             raise RuntimeError(f"{self.name} failed: {error}") from error
         device = self._broken.device
         if not isinstance(value, Tensor) or value.device != device:

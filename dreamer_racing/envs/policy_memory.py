@@ -1,4 +1,4 @@
-"""Environments with what a policy reads beside observations: where episodes begin, and what it remembers."""
+"""Transforms that give a policy its inputs beside observations: the `is_init` flag and its recurrent state."""
 
 from tensordict import TensorDictBase
 from torchrl.envs import Compose, EnvBase, InitTracker, TensorDictPrimer, Transform, TransformedEnv
@@ -7,14 +7,14 @@ from dreamer_racing.envs.torchrl_env import DroneRacingEnv
 
 
 def with_memory(env: EnvBase, primer: Transform) -> TransformedEnv:
-    """Give an environment `is_init` and the keys of a policy's memory.
+    """Add `is_init` and the policy's recurrent state to an environment.
 
     Args:
-        env: any.
-        primer: of the policy, ``policy.make_primer()``: what it remembers where an episode begins.
+        env: any TorchRL environment.
+        primer: the initial recurrent state of the policy, from ``policy.make_primer()``.
 
     Raises:
-        TypeError: something else than a transform, such as the policy itself.
+        TypeError: ``primer`` is not a transform, for example the policy itself.
 
     Example:
         >>> from torchrl.data import Unbounded
@@ -29,15 +29,15 @@ def with_memory(env: EnvBase, primer: Transform) -> TransformedEnv:
 
 
 class RaceWithMemory(TransformedEnv):
-    """A `DroneRacingEnv` with `InitTracker` and a primer of zeros, as `with_memory` makes it.
+    """A `DroneRacingEnv` with `InitTracker` and an all-zero primer, made by `with_memory`.
 
-    Between two steps the race begins episodes in place, with zeros for all that is not its own. TorchRL would make
-    another observation of all worlds, transform it, choose between the two, and wait for a CUDA device twelve times;
-    it does so here, too, once further transforms are appended.
+    Ended episodes are reset in place, and every key that the race does not write is zeroed. TorchRL's own reset
+    observes all worlds again, transforms and merges both observations, and synchronises with a CUDA device twelve
+    times; it is used here only if further transforms are appended.
     """
 
     def maybe_reset(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Begin episodes where one ended, in place."""
+        """Reset in place the environments whose episode ended."""
         if len(self.transform) > 2 or not self.base_env.is_of_a_step(tensordict):
             return super().maybe_reset(tensordict)
         ended = tensordict.get("done").clone()
@@ -45,7 +45,7 @@ class RaceWithMemory(TransformedEnv):
 
 
 def _begins_with_zeros(primer: Transform) -> bool:
-    """Whether a transform does nothing but give zeros where an episode begins."""
+    """Return whether a transform only writes zeros at the start of an episode."""
     if isinstance(primer, Compose):
         return all(_begins_with_zeros(part) for part in primer)
     if not isinstance(primer, TensorDictPrimer) or primer.random:

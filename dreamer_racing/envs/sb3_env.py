@@ -1,7 +1,7 @@
-"""The race for Stable-Baselines3: N drones in one process as one of its vector environments.
+"""The race for Stable-Baselines3: N drones in one process as a `VecEnv`.
 
-Spaces and the entries of `info` are those of `dreamer_racing.envs.gym_env`. Stable-Baselines3 is not among the
-package's own dependencies: `pip install -e '.[sb3]'`. Shapes: N environments.
+Spaces and the entries of `info` are those of `dreamer_racing.envs.gym_env`. Stable-Baselines3 is an optional
+dependency: `pip install -e '.[sb3]'`. Shapes: N environments.
 """
 
 from collections.abc import Sequence
@@ -24,11 +24,11 @@ _ONE_OBJECT = (
 
 
 class DroneRaceVecEnv(VecEnv):
-    """N drones racing at once, much faster than N single environments in a `DummyVecEnv`.
+    """N drones racing in parallel, much faster than N single environments in a `DummyVecEnv`.
 
-    As Stable-Baselines3 has it, a drone whose episode ends begins the next one in the same step: `info` then holds
-    `terminal_observation`, and `TimeLimit.truncated` says that it was no crash. One seed, that of `seed`, makes all
-    drones reproducible from the next `reset` on.
+    As in every `VecEnv`, an episode that ends is reset in the same step: `info` then has `terminal_observation`, and
+    `TimeLimit.truncated`, true if it was truncated and not a crash. A seed set by `seed` makes all drones
+    reproducible from the next `reset` on.
 
     Args:
         track: name of a built-in track, path to a YAML file, or a `Track`.
@@ -38,12 +38,12 @@ class DroneRaceVecEnv(VecEnv):
         privileged: whether `info` has the state.
         body_rate_weight: b₂ of paper Eq. 1; that of `RewardWeights` if None.
         preset: physics preset (`easy`, `faithful`, `betaflight`) or parameters.
-        render_view: of frames: `chase`, the drone from outside, or `onboard`, what it sees.
+        render_view: view of rendered frames: `chase`, the drone from outside, or `onboard`, its nose camera.
         worlds: further arguments of `RaceWorlds`; see `WorldOptions`.
 
     Raises:
-        ValueError: bad argument; the message says which and what is allowed.
-        TrackError: unknown or broken track.
+        ValueError: invalid argument; the message says which and what is allowed.
+        TrackError: unknown or invalid track.
 
     Example:
         >>> env = DroneRaceVecEnv("circle", num_envs=16, observation="vector")
@@ -73,7 +73,7 @@ class DroneRaceVecEnv(VecEnv):
         cast(dict[str, Any], self.metadata)["render_fps"] = self.race.frames_per_second
 
     def reset(self) -> Observation:
-        """Begin an episode everywhere."""
+        """Begin an episode in all environments."""
         if self._seeds[0] is not None:
             self.race.worlds.seed(self._seeds[0])
         self._reset_seeds()
@@ -83,11 +83,11 @@ class DroneRaceVecEnv(VecEnv):
         return self.race.observe()
 
     def step_async(self, actions: np.ndarray) -> None:
-        """Take the actions (N, 4) of the step that `step_wait` flies; values beyond [-1, 1] are clipped."""
+        """Store the actions (N, 4) that `step_wait` applies; values beyond [-1, 1] are clipped."""
         self._actions = actions
 
     def step_wait(self) -> tuple[Observation, np.ndarray, np.ndarray, list[dict[str, Any]]]:
-        """Fly one control step; return observations, rewards (N,), ends (N,) and N `info`.
+        """Simulate one control step; return observations, rewards (N,), dones (N,) and N `info`.
 
         Raises:
             ValueError: actions of the wrong shape.
@@ -105,7 +105,7 @@ class DroneRaceVecEnv(VecEnv):
         return observation, rewards.astype(np.float32), ended, infos
 
     def _begin(self, mask: np.ndarray, observation: Observation) -> Observation:
-        """Begin episodes where masked (N,) bool; return the observations with their first ones in place."""
+        """Begin episodes where masked (N,) bool; return the observations with these rows replaced by the first ones."""
         self.race.begin(mask)
         info = self.race.info(None)
         for index in np.flatnonzero(mask).tolist():
@@ -113,7 +113,7 @@ class DroneRaceVecEnv(VecEnv):
         return with_rows(observation, mask, self.race.observe(mask))
 
     def get_images(self) -> Sequence[np.ndarray | None]:
-        """The drones from outside, or what they see, N images uint8 (256, 256, 3); None without a render mode."""
+        """Return the chase or onboard views, N images uint8 (256, 256, 3); None without a render mode."""
         return list(self.race.frames()) if self.render_mode == "rgb_array" else [None] * self.num_envs
 
     def close(self) -> None:
@@ -121,19 +121,19 @@ class DroneRaceVecEnv(VecEnv):
         self.race.close()
 
     def get_attr(self, attr_name: str, indices: VecEnvIndices = None) -> list[Any]:
-        """This object's attribute, once for each of these drones."""
+        """Return this object's attribute, once for each selected drone."""
         return [getattr(self, attr_name) for _ in self._get_indices(indices)]
 
     def set_attr(self, attr_name: str, value: Any, indices: VecEnvIndices = None) -> None:
-        """Refused: the drones share one object."""
+        """Raise an error: the drones share one object."""
         raise NotImplementedError(f"set_attr({attr_name!r}): {_ONE_OBJECT}")
 
     def env_method(
         self, method_name: str, *method_args: Any, indices: VecEnvIndices = None, **method_kwargs: Any
     ) -> Any:
-        """Refused: the drones share one object."""
+        """Raise an error: the drones share one object."""
         raise NotImplementedError(f"env_method({method_name!r}): {_ONE_OBJECT}")
 
     def env_is_wrapped(self, wrapper_class: type[gymnasium.Wrapper], indices: VecEnvIndices = None) -> list[bool]:
-        """No drone is wrapped on its own."""
+        """Return False for each selected drone: none is wrapped individually."""
         return [False for _ in self._get_indices(indices)]

@@ -21,17 +21,17 @@ from dreamer_racing.settings import check_flags
 
 
 class DroneRacingEnv(EnvBase):
-    """N drones racing at once, in one process, without ParallelEnv.
+    """N drones racing in parallel in one process, without ParallelEnv.
 
     Args:
         track: name of a built-in track, path to a YAML file, or a `Track`.
         num_envs: N; the batch size is [N].
-        device: where the worlds and all tensors live, `cpu` or a CUDA device; see `RaceWorlds`.
-        from_pixels: whether there are `pixels`; if not there is a `vector` instead, see `RaceVector`. A `vector=` of
-            one's own is there in either case.
+        device: device of the worlds and all tensors, `cpu` or a CUDA device; see `RaceWorlds`.
+        from_pixels: whether to observe `pixels`; if not, `vector` instead, see `RaceVector`. A user-defined `vector=`
+            is observed in either case.
         privileged: whether there are `("privileged", ...)` entries.
         preset: physics preset (`easy`, `faithful`, `betaflight`) or parameters.
-        seed: of start poses and of the randomisation of physics and looks, one stream for all drones.
+        seed: seed of start poses and of the randomisation of physics and looks, one stream for all drones.
         worlds: further arguments of `RaceWorlds`, see `RaceOptions`.
 
     Attributes:
@@ -54,7 +54,7 @@ class DroneRacingEnv(EnvBase):
         seed: int | None = None,
         **worlds: Unpack[RaceOptions],
     ) -> None:
-        # before TorchRL, which would refuse arguments in torch's own words
+        # before TorchRL raises its own error for unknown arguments
         check_options(DroneRacingEnv, worlds, RaceOptions)
         check_flags(privileged=privileged)
         race = RaceWorlds(track, num_envs, preset, from_pixels=from_pixels, device=device, seed=seed, **worlds)
@@ -65,7 +65,7 @@ class DroneRacingEnv(EnvBase):
         self.track = race.track
         self.body_rate_weight = self.worlds.race.weights.body_rate
         self._make_specs()
-        self.is_closed = False  # TorchRL takes an environment that it does not wrap for one that has nothing to close
+        self.is_closed = False  # by default TorchRL regards an unwrapped environment as closed
 
     def _make_specs(self) -> None:
         n = self.batch_size
@@ -140,11 +140,11 @@ class DroneRacingEnv(EnvBase):
         return self._group(data)
 
     def maybe_reset(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Begin episodes where one ended, in place: what ``EnvBase`` does, without merging two observations.
+        """Reset ended episodes in place, like ``EnvBase`` but without merging two observations.
 
-        The worlds that fly on have not moved, so all are observed again; only images are drawn and merged row by row.
-        All else, of the race or of a policy, is zero where an episode begins (``EnvBase``: unless all begin at once).
-        On a CUDA device it waits once: to know how many ended.
+        The states of all worlds are read again, as those that fly on are unchanged; images are rendered only for the
+        rows that were reset. All other keys, of the race or of a policy, are zero where an episode begins (``EnvBase``:
+        unless all begin together). On a CUDA device it synchronises once, to count the ended episodes.
         """
         if not self.is_of_a_step(tensordict):
             return super().maybe_reset(tensordict)
@@ -155,7 +155,7 @@ class DroneRacingEnv(EnvBase):
         self.worlds.reset(None if len(rows) == len(ended) else ended)
         seen = self._observe()
         if self.from_pixels:
-            seen["pixels"] = tensordict.get("pixels").clone()  # the step before keeps its own as its outcome
+            seen["pixels"] = tensordict.get("pixels").clone()  # the previous step keeps its own images
             seen["pixels"][rows] = self.worlds.render(rows)
         for key, value in list(tensordict.items(include_nested=True, leaves_only=True)):
             if (key if isinstance(key, str) else key[0]) not in seen:
@@ -163,20 +163,20 @@ class DroneRacingEnv(EnvBase):
         return tensordict.update(seen)
 
     def is_of_a_step(self, tensordict: TensorDictBase) -> bool:
-        """Whether data have what a step of this environment returns, as a caller's own may not."""
+        """Return whether data have the keys that a step of this environment returns."""
         return "done" in tensordict and not (self.from_pixels and "pixels" not in tensordict)
 
     def _column(self, values: Tensor) -> Tensor:
-        """(N,) → (N, 1), floats as float32."""
+        """Reshape (N,) to (N, 1), with floats as float32."""
         values = values.unsqueeze(-1)
         return values.float() if values.is_floating_point() else values
 
     def _group(self, data: dict[str, Any]) -> TensorDict:
-        """Entries of all worlds as one TensorDict [N]."""
+        """Return the entries of all worlds as one TensorDict [N]."""
         return TensorDict(data, self.batch_size, device=self.device)
 
     def _observe(self) -> dict[str, Any]:
-        """What the worlds' states show now, without images."""
+        """Return the current observations without images."""
         data: dict[str, Any] = {} if self.worlds.imu is None else {"imu": self.worlds.imu.sample}
         if not self.from_pixels or self.worlds.own_vector is not None:
             data["vector"] = self.worlds.observed_vector()
@@ -186,7 +186,7 @@ class DroneRacingEnv(EnvBase):
         return data
 
     def _draw(self, mask: Tensor | None) -> Tensor:
-        """Images of all worlds (N, H, W, 3); after a partial reset only those rows are drawn, the rest is blank."""
+        """Return images (N, H, W, 3); after a partial reset only the masked rows are rendered, the others are black."""
         images = self.worlds.render(mask)
         if mask is None:
             return images
@@ -198,14 +198,14 @@ class DroneRacingEnv(EnvBase):
         self.worlds.seed(seed)
 
     def state_dict(self) -> dict[str, Any]:
-        """What an environment with the same arguments needs to go on exactly as this one would, bit for bit."""
+        """Return the state with which an environment with the same arguments continues bit for bit like this one."""
         return {"worlds": self.worlds.state_dict(), "body_rate_weight": self.body_rate_weight}
 
     def load_state_dict(self, state_dict: Mapping[str, Any]) -> None:
-        """Go on from what `state_dict` returned.
+        """Restore what `state_dict` returned.
 
         Raises:
-            ValueError: it is of another number of worlds.
+            ValueError: it does not fit these worlds, for example has another number of them.
         """
         self.worlds.load_state_dict(state_dict["worlds"])
         self.body_rate_weight = state_dict["body_rate_weight"]

@@ -1,7 +1,7 @@
-"""Windows on the race: `RaceWindow`, MuJoCo's viewer beside a flight, and `view("kidney")`, dm_control's viewer.
+"""Interactive viewers: `RaceWindow`, MuJoCo's viewer of a running flight, and `view("kidney")`, dm_control's viewer.
 
-They need a display. Where there is none, both say what is missing instead of failing inside GLFW; record a video or
-call `env.physics.render(480, 640, camera_id="spectator")` there. In either window F1 lists the keys; in dm_control's,
+They need a display. Without one, both report what is missing instead of failing inside GLFW; record a video or call
+`env.physics.render(480, 640, camera_id="spectator")` instead. In either window F1 lists the keys; in dm_control's,
 `[` and `]` switch between the free camera, the drone's `nose` and the `spectator`.
 """
 
@@ -21,9 +21,9 @@ from dreamer_racing.envs.simulator.scene import build_scene
 from dreamer_racing.envs.worlds import RaceWorlds
 
 GL_WINDOW_LIBRARIES = ("libGL.so.1", "libGL.so", "libOpenGL.so.0")
-INSET_SHARE, INSET_MARGIN = 0.4, 8  # of the window's lesser side that the camera's image takes, at most; pixels
-CHASE_DISTANCE, CHASE_ELEVATION = 5.0, -35.0  # m and degrees, from the drone to who looks at it
-HIDDEN_GROUP = 4  # of geoms, which the viewer shows at the press of this digit
+INSET_SHARE, INSET_MARGIN = 0.4, 8  # largest share of the window's shorter side; pixels
+CHASE_DISTANCE, CHASE_ELEVATION = 5.0, -35.0  # of the viewer's camera relative to the drone, m and degrees
+HIDDEN_GROUP = 4  # geom group that the viewer hides until this digit key is pressed
 
 
 class ViewerUnavailableError(RuntimeError):
@@ -31,17 +31,17 @@ class ViewerUnavailableError(RuntimeError):
 
 
 class WindowClosedError(Exception):
-    """The one who looked on has closed the window."""
+    """The user has closed the window."""
 
 
 class RaceWindow:
-    """MuJoCo's viewer on the flight of one drone, with what its camera sees in a corner.
+    """MuJoCo's viewer of the flight of one drone, with its camera image in a corner.
 
-    The window follows the drone, and can be turned with the mouse; walls and ceiling, which would stand in the way, are
-    hidden until the key 4 is pressed. It keeps a flight at the speed of time.
+    The camera follows the drone and can be turned with the mouse; walls and ceiling, which would block the view, are
+    hidden until the key 4 is pressed. The window slows the flight down to real time.
 
     Args:
-        worlds: of the flight, N = 1; they fly on their own, the window has a scene of its own.
+        worlds: worlds of the flight, N = 1; the window renders a separate copy of their scene.
 
     Raises:
         ViewerUnavailableError: no window can be opened here.
@@ -63,13 +63,13 @@ class RaceWindow:
         camera.distance, camera.elevation = CHASE_DISTANCE, CHASE_ELEVATION
 
     def show(self, tensordict: TensorDictBase) -> None:
-        """Show a flight as it is, when that is due.
+        """Show the current state of a flight, and wait until the next one is due.
 
         Args:
-            tensordict: of a `DroneRacingEnv`, [1]: `privileged`, `race` and, where the drone sees images, `pixels`.
+            tensordict: from a `DroneRacingEnv`, [1]: `privileged`, `race` and, if there are images, `pixels`.
 
         Raises:
-            WindowClosedError: nobody looks on any longer.
+            WindowClosedError: the user has closed the window.
         """
         self._refuse_closed()
         state = {name: value[0].cpu().numpy() for name, value in tensordict["privileged"].items()}
@@ -79,7 +79,7 @@ class RaceWindow:
         self._viewer.set_texts((None, mujoco.mjtGridPos.mjGRID_TOPLEFT, *self._words(tensordict)))
         images = tensordict.get("pixels", None)
         if images is not None:
-            self._refuse_closed()  # by now: to ask a closed window for its size is a segmentation fault
+            self._refuse_closed()  # again: asking a closed window for its size is a segmentation fault
             self._viewer.set_images(self._inset(images[0].cpu().numpy()))
         self._viewer.sync()
         self._due = max(self._due + self._control_dt, time.monotonic())
@@ -88,7 +88,7 @@ class RaceWindow:
     def close(self) -> None:
         """Close the window."""
         self._viewer.close()
-        for thread in self._threads:  # at the interpreter's end GLFW would be taken from one that still draws
+        for thread in self._threads:  # at exit, GLFW must not be terminated while one still draws
             thread.join()
 
     def _refuse_closed(self) -> None:
@@ -96,7 +96,7 @@ class RaceWindow:
             raise WindowClosedError
 
     def _words(self, tensordict: TensorDictBase) -> tuple[str, str]:
-        """Names and values of what can be read off a flight, a line each."""
+        """Return names and values of the overlay text, one line each."""
         gates, lap = self._track.num_gates, int(tensordict["race", "gates_passed"]) // self._track.num_gates + 1
         rows = {
             "lap": f"{lap}/{self._track.laps}",
@@ -106,7 +106,7 @@ class RaceWindow:
         return "\n".join(rows), "\n".join(rows.values())
 
     def _inset(self, image: np.ndarray) -> tuple[mujoco.MjrRect, np.ndarray]:
-        """An image (H, W, 3) enlarged by a whole factor, and its place in the window: below, on the right."""
+        """Return the image's rectangle in the window, at the lower right, and the image (H, W, 3) enlarged to fit."""
         window = self._viewer.viewport
         scale = max(1, int(INSET_SHARE * min(window.width, window.height) / max(image.shape[:2])))
         large = image.repeat(scale, axis=0).repeat(scale, axis=1)
@@ -115,7 +115,7 @@ class RaceWindow:
 
 
 def _scene_to_look_into(worlds: RaceWorlds) -> mujoco.MjModel:
-    """Compile the scene of these worlds, walls and ceiling hidden."""
+    """Compile the scene of these worlds with hidden walls and ceiling."""
     spec = build_scene(worlds.track, worlds.parameters, worlds.camera)
     for geom in spec.geoms:
         if geom.name.startswith(("wall", "ceiling")):
@@ -160,7 +160,7 @@ def launch_viewer(env: Any, policy: Callable[[Any], np.ndarray] | None = None) -
 
 
 def hover(time_step: Any) -> np.ndarray:
-    """The action (4,) that holds altitude when level, whatever the observation."""
+    """Return the action (4,) that holds altitude when level; the observation is ignored."""
     from dreamer_racing.envs.drone.parameters import QuadrotorParameters
 
     return np.array([QuadrotorParameters().hover_action, 0.0, 0.0, 0.0], np.float32)
@@ -170,7 +170,7 @@ def check_viewer(environment: Mapping[str, str] = os.environ) -> None:
     """Check that dm_control can open a window, before it tries.
 
     Args:
-        environment: the environment variables to judge.
+        environment: the environment variables to check.
 
     Raises:
         ViewerUnavailableError: it cannot; the message is one paragraph that names everything that is missing.
@@ -192,8 +192,8 @@ def check_window(environment: Mapping[str, str] = os.environ, missing: Sequence[
     """Check that a window can be opened, before MuJoCo tries.
 
     Args:
-        environment: the environment variables to judge.
-        missing: what is known to be in the way.
+        environment: the environment variables to check.
+        missing: further reasons that are already known.
 
     Raises:
         ViewerUnavailableError: it cannot; the message, without a full stop, names everything that is missing.
@@ -204,7 +204,7 @@ def check_window(environment: Mapping[str, str] = os.environ, missing: Sequence[
 
 
 def _missing_display(environment: Mapping[str, str]) -> list[str]:
-    """What a window needs and this Linux machine lacks; nothing elsewhere, where a desktop is taken for granted."""
+    """Return what this Linux machine lacks for a window; nothing on other systems, where a desktop is assumed."""
     if not sys.platform.startswith("linux"):
         return []
     missing = []
@@ -216,7 +216,7 @@ def _missing_display(environment: Mapping[str, str]) -> list[str]:
 
 
 def _missing_glfw() -> list[str]:
-    """What GLFW itself says; asked last, because starting it is what fails without a display."""
+    """Return why GLFW cannot start; checked last, because its start is what fails without a display."""
     try:
         import glfw
     except (ImportError, OSError) as error:

@@ -1,4 +1,4 @@
-"""`RaceWorlds`: simulator, race rules and start poses put together, N drones on N copies of a track.
+"""`RaceWorlds`: simulator, race rules and start poses combined, for N drones on N copies of a track.
 
 The TorchRL and Gymnasium environments are thin adapters of this class. Shapes: N worlds, A action (4). SI units.
 """
@@ -54,7 +54,7 @@ ACTION_SIZE = 4
 
 
 class RaceOptions(TypedDict, total=False):
-    """Arguments of `RaceWorlds`, which says what they mean, that every environment made of it takes and hands on."""
+    """Arguments that every environment passes on to `RaceWorlds`, where they are documented."""
 
     evaluation: bool
     episode_steps: int | None
@@ -78,24 +78,24 @@ class RaceOptions(TypedDict, total=False):
 
 
 class WorldOptions(RaceOptions, total=False):
-    """Those, where an environment has no `device` and `seed` of its own."""
+    """`RaceOptions` plus `device` and `seed`, for environments that do not have these arguments themselves."""
 
     device: torch.device | str
     seed: int | None
 
 
 def check_options(environment: type, given: Mapping[str, object], options: type) -> None:
-    """Refuse arguments that an environment neither has nor hands on to `RaceWorlds`.
+    """Refuse arguments that neither an environment nor `RaceWorlds` takes.
 
-    In Python's own words, by which TorchRL's `GymEnv` knows that an environment takes no frameskip.
+    The message has Python's wording, by which TorchRL's `GymEnv` detects that an environment takes no frameskip.
 
     Args:
-        environment: whose `__init__` was called, with what it has no argument for.
-        given: those.
+        environment: the class whose `__init__` was called.
+        given: the keyword arguments that it does not name itself.
         options: `RaceOptions` or `WorldOptions`.
 
     Raises:
-        TypeError: the message names environment, argument and the nearest that there is.
+        TypeError: the message names the environment, the argument and the closest known argument.
     """
     own = [
         name for name in inspect.signature(vars(environment)["__init__"]).parameters if name not in ("self", "worlds")
@@ -111,48 +111,47 @@ def check_options(environment: type, given: Mapping[str, object], options: type)
 
 
 class RaceWorlds:
-    """N drones, each alone in its own copy of the race.
+    """N independent copies of the race, with one drone each.
 
     Args:
         track: name of a built-in track, path to a YAML file, or a `Track`.
         num_envs: N.
         preset: physics preset (`easy`, `faithful`, `betaflight`) or parameters.
         evaluation: start at the start pose, at rest, and finish after the track's laps.
-        episode_steps: control steps until an episode is truncated; if None those of 20 s, in evaluation of 30 s.
-        weights: of the reward, paper Eq. 1.
-        from_pixels: whether to have a renderer at all.
-        renderer: `auto`, or on CPU a name out of `rendering.RENDERERS`, or `warp_cuda`: drawn on a CUDA device.
+        episode_steps: control steps until an episode is truncated; None for 20 s, in evaluation 30 s.
+        weights: reward weights of Eq. 1 of the paper.
+        from_pixels: whether images are rendered.
+        renderer: `auto`, or on CPU a name from `rendering.RENDERERS`, or `warp_cuda` to render on a CUDA device.
         camera: the nose camera.
-        looks: `nominal`, or `randomised` for another light, colours, camera tilt, lens and noise in every episode, or
-            how far each varies.
-        num_threads: of physics and rendering on CPU; if None one a CPU, at most `OMP_NUM_THREADS`.
-        device: `cpu` or a CUDA device, where everything lives. On CUDA a step is one graph that never waits.
+        looks: `nominal`; `randomised` for new light, colours, camera tilt, lens and noise in every episode; or the
+            ranges of the randomisation.
+        num_threads: threads of physics and rendering on CPU; None for one per CPU, at most `OMP_NUM_THREADS`.
+        device: `cpu` or a CUDA device. On CUDA a step is one CUDA graph without synchronisation.
         backend: `auto` (`mujoco` on CPU, `mujoco_warp` on CUDA), `mujoco`, or `mujoco_warp` (on CPU for tests: slow).
-        seed: of start poses and of the randomisation of physics and looks.
-        start_beyond_gate: share of training episodes, but for those on the line, that begin behind a gate; see
+        seed: seed of start poses and of the randomisation of physics and looks.
+        start_beyond_gate: share of the training episodes not on the racing line that begin behind a gate; see
             `StartSampler`.
-        start_at_gate: share of the others, but for those on the line, that begin before a gate instead of at the start.
+        start_at_gate: share of the remaining training episodes that begin before a gate instead of at the start.
         start_on_line: share of training episodes that begin on a planned racing line, which takes some seconds to plan.
-        start_noise: of evaluation starts, as a multiple of the noise of training starts.
-        miss_radius: training episodes end, as with a crash, where the target gate's plane is crossed beside its frame
-            and less than so far from its centre, m; if 0 the drone flies on. For tracks whose way to a gate does not
-            lead past it.
-        action_change_weight: b₃, penalty in training for each unit of ‖aₜ − aₜ₋₁‖², but in a step that ends in a crash
-            and the first of an episode; 0 as in the paper. Champion-level drone racing (Kaufmann et al., Nature 620,
-            2023, Extended Data Table 1a: λ₅, with λ₁ = 1 for a metre of progress, as here) has 1e-4.
-        control_rate: actions a second, Hz; if None the preset's, 50.
-        camera_rate: frames a second, Hz, `control_rate` divided by a whole number: an image is shown until the next
-            one, and none is drawn in between; if None the camera's, a frame at every control step.
-        imu: gyro and accelerometer beside the images: `exact`, `noisy` (see `IMUS`), or by how much they err; None for
-            none.
-        reward: function of a `Transition` that returns the rewards (N,), in place of Eq. 1 without the penalty of body
-            rates; or `module:function`; None for Eq. 1. See `docs/own_rewards.md`.
-        vector: function of a `RaceState` that returns numbers (N, V) which agents see, beside images or without; or
-            `module:function`; None for the race vector where there are no images.
+        start_noise: noise of evaluation starts, as a multiple of that of training starts.
+        miss_radius: a training episode ends with a crash if the target gate's plane is crossed outside its frame and
+            less than this distance from its centre, m; 0 to fly on. Only for tracks on which the path to a gate does
+            not lead past it.
+        action_change_weight: b₃, penalty in training per unit of ‖aₜ − aₜ₋₁‖², except in the first step of an episode
+            and in a step that ends in a crash; 0 as in the paper. Champion-level drone racing (Kaufmann et al., Nature
+            620, 2023, Extended Data Table 1a: λ₅, with λ₁ = 1 per metre of progress, as here) has 1e-4.
+        control_rate: actions per second, Hz; None for the preset's, 50.
+        camera_rate: frames per second, Hz: `control_rate` divided by a whole number. The image is repeated, not
+            rendered again, until the next frame; None for the camera's rate, by default a frame per control step.
+        imu: gyro and accelerometer beside the images: `exact`, `noisy` (see `IMUS`), or an error model; None for none.
+        reward: function of a `Transition` that returns the rewards (N,), in place of Eq. 1 without its body-rate
+            penalty; or `module:function`; None for Eq. 1. See `docs/own_rewards.md`.
+        vector: function of a `RaceState` that returns the observation `vector` (N, V), with or without images; or
+            `module:function`; None for the race vector if there are no images.
 
     Raises:
-        ValueError: bad argument; the message says which and what is allowed.
-        TrackError: unknown or broken track.
+        ValueError: invalid argument; the message says which and what is allowed.
+        TrackError: unknown or invalid track.
 
     Example:
         >>> worlds = RaceWorlds("circle", num_envs=2, from_pixels=False)
@@ -161,7 +160,7 @@ class RaceWorlds:
         torch.Size([2])
     """
 
-    _images: Tensor | None = None  # of all worlds as they are, where a step drew them
+    _images: Tensor | None = None  # (N, H, W, 3) current images, if the last step rendered them
 
     def __init__(
         self,
@@ -221,11 +220,11 @@ class RaceWorlds:
         self._make_rewards(action_change_weight, reward)
         self._starts = self._make_starts(start_beyond_gate, start_at_gate, start_noise, start_on_line)
         self._held = HeldFrames(interval, self._draw) if from_pixels and interval > 1 else None
-        self._graphs: dict[bool, GraphedFunction] = {}  # of a control step, by whether it draws
+        self._graphs: dict[bool, GraphedFunction] = {}  # CUDA graphs of a control step, by whether it renders
         self.begun = False
 
     def _make_race(self, weights: RewardWeights | None, episode_steps: int | None, miss_radius: float) -> Race:
-        """Make the rules, of training or of evaluation."""
+        """Make the race rules for training or evaluation."""
         check_numbers({}, {"miss_radius": miss_radius})
         if episode_steps is None:
             episode_steps = round((EVALUATION_TIME if self.evaluation else EPISODE_TIME) / self.parameters.control_dt)
@@ -236,12 +235,12 @@ class RaceWorlds:
             episode_steps=episode_steps,
             laps=self.track.laps if self.evaluation else None,
             control_dt=self.parameters.control_dt,
-            device=self.device,  # in float32: a micrometre is enough for gates, at half the time
+            device=self.device,  # in float32: micrometre precision suffices for gates, in half the time
             miss_radius=0.0 if self.evaluation else miss_radius,
         )
 
     def _make_numbers(self, errors: ImuErrors | None, vector: str | VectorFunction | None) -> None:
-        """Make what tells agents numbers: the IMU, and the race vector or a function of one's own."""
+        """Make the sources of vector observations: the IMU, and the race vector or a user-defined function."""
         if vector is not None and errors is not None:
             raise ValueError("imu= and vector=: agents see one set of numbers, leave one of them out.")
         self.imu = None if errors is None else Imu(errors, self.simulator.feel, self._generator)
@@ -254,14 +253,14 @@ class RaceWorlds:
             self.vector_size = self.observed_vector().shape[1]
 
     def _make_rewards(self, weight: float, reward: str | RewardFunction | None) -> None:
-        """Set b₃, which is of training alone, and the function of one's own that pays, if there is one."""
+        """Set b₃, which applies only in training, and the user-defined reward function, if any."""
         check_setting("action_change_weight", weight, NOT_NEGATIVE)
         self.action_change_weight = 0.0 if self.evaluation else float(weight)
         self.own_reward = None if reward is None else OwnFunction("reward", reward, self.num_envs, self.device)
         self._remembers = bool(self.action_change_weight or self.own_reward or self.own_vector)
 
     def _make_starts(self, beyond_gate: float, at_gate: float, noise: float, on_line: float) -> StartSampler:
-        """Make the sampler of start poses, and plan the line for it if episodes begin there."""
+        """Make the sampler of start poses, and plan the racing line if episodes begin on it."""
         shares = {"start_beyond_gate": beyond_gate, "start_at_gate": at_gate, "start_on_line": on_line}
         check_numbers({}, {**shares, "start_noise": noise})
         if not 0.0 <= on_line <= 1.0:
@@ -284,7 +283,7 @@ class RaceWorlds:
 
     @property
     def start_on_line(self) -> float:
-        """Share of training episodes that begin on the racing line; settable where there was one from the start."""
+        """Share of training episodes that begin on the racing line; settable only if it was positive initially."""
         return self._starts.on_line
 
     @start_on_line.setter
@@ -295,7 +294,7 @@ class RaceWorlds:
         """Seed start poses and physics randomisation; None draws a seed from the operating system.
 
         Raises:
-            ValueError: it is no whole number, or not in the range of a generator's.
+            ValueError: the seed is no integer, or out of a generator's range.
         """
         check_numbers(without_none(seed=seed), {})
         if seed is not None and not 0 <= seed < 2**63:
@@ -306,7 +305,7 @@ class RaceWorlds:
             self._generator.manual_seed(int(seed))
 
     def _check_process(self) -> None:
-        """Refuse to work in a child: a fork copies no threads, and whoever waits for theirs waits for ever."""
+        """Refuse to run in a forked child, which lacks the worker threads and would wait for them for ever."""
         if os.getpid() != self._process:
             raise RuntimeError(
                 f"These worlds were made in process {self._process}, and process {os.getpid()} was forked from it, "
@@ -315,7 +314,7 @@ class RaceWorlds:
             )
 
     def reset(self, mask: Tensor | None = None) -> None:
-        """Start new episodes in the masked worlds (N,) bool; in all if None.
+        """Begin new episodes in the masked worlds (N,) bool; in all if None.
 
         Raises:
             RuntimeError: this process was forked from the one that made the worlds.
@@ -333,21 +332,21 @@ class RaceWorlds:
         if self._remembers:
             self._last_action.masked_fill_(mask.unsqueeze(-1), 0.0)
         if self._held is not None:
-            together = whole or (self.device.type == "cpu" and bool(mask.all()))  # elsewhere that would wait
+            together = whole or (self.device.type == "cpu" and bool(mask.all()))  # on CUDA it would synchronise
             self._held.begin(None if together else mask)
         if self.imu is not None:
             self.imu.begin(mask)
 
     def step(self, action: Tensor) -> RaceStep:
-        """Fly one control step. The simulator is not differentiable: no gradient goes back to the action.
+        """Simulate one control step. The simulator is not differentiable: no gradient flows to the action.
 
         Args:
-            action: (N, 4), on the worlds' device; values beyond [-1, 1] are clipped. A drone with a non-finite action
-                has crashed: its episode ends and the others fly on.
+            action: (N, 4), on the worlds' device; values beyond [-1, 1] are clipped. A non-finite action is a crash of
+                its drone only.
 
         Raises:
             RuntimeError: no episode has begun, or this process was forked from the one that made the worlds.
-            TypeError: not of a floating-point type.
+            TypeError: the action is not of a floating-point type.
             ValueError: wrong shape or device.
         """
         self._check_process()
@@ -355,7 +354,7 @@ class RaceWorlds:
             raise RuntimeError("Step before the first reset: call reset() to begin episodes.")
         if not action.is_floating_point():
             raise wrong_action_type(action.dtype)
-        action = action.detach()  # or the commands that are under way would keep every graph before them
+        action = action.detach()  # delayed commands would otherwise keep all previous autograd graphs
         if action.shape != (self.num_envs, ACTION_SIZE):
             raise ValueError(
                 f"Action of shape {tuple(action.shape)}: {self.num_envs} environment(s) take one of shape "
@@ -371,7 +370,7 @@ class RaceWorlds:
         return outcome
 
     def _replay(self, action: Tensor) -> RaceStep:
-        """Fly one control step as a CUDA graph, and draw where a frame is due."""
+        """Replay one control step as a CUDA graph, including the rendering if a frame is due."""
         draws = self._from_pixels and (self._held is None or self._held.next_is_frame)
         if draws not in self._graphs:
             self._graphs[draws] = self._capture(action, draws)
@@ -380,10 +379,10 @@ class RaceWorlds:
         return RaceStep(*outcome)
 
     def _fly(self, action: Tensor) -> RaceStep:
-        """Fly one control step and judge it; nothing here waits for a CUDA device."""
+        """Simulate one control step and apply the race rules, without synchronising with a CUDA device."""
         invalid = ~action.isfinite().all(dim=1)
         flown = action.nan_to_num(0.0, 0.0, 0.0)
-        goes_on = self.race.step_count > 0  # before the step: the first of an episode changes nothing
+        goes_on = self.race.step_count > 0  # the first step of an episode has no previous action
         before = None if self.own_reward is None else self.race_state()
         path = self.simulator.step(flown)
         outcome = self.race.step(path, self.simulator.state.body_rates, invalid)
@@ -400,9 +399,9 @@ class RaceWorlds:
         return replace(outcome, reward_base=outcome.reward_base - self.action_change_weight * change)
 
     def _capture(self, action: Tensor, draws: bool) -> GraphedFunction:
-        """Capture physics, race and perhaps images of a step as one CUDA graph, and leave the worlds as they were.
+        """Capture the physics, race rules and, if ``draws``, rendering of a step as one CUDA graph; restore the worlds.
 
-        The graph keeps the race's rules (laps, episode_steps, weights) as they are now.
+        The graph keeps the current race rules (laps, episode_steps, weights).
         """
 
         def fly_and_draw(action: Tensor) -> list[Tensor]:
@@ -423,29 +422,29 @@ class RaceWorlds:
         return graph
 
     def render(self, rows: Tensor | None = None) -> Tensor:
-        """Images uint8 (M, height, width, 3) of all worlds, or of M rows: a mask (N,) bool, or numbers (M,).
+        """Return images uint8 (M, height, width, 3) of all worlds, or of M rows: a mask (N,) bool, or indices (M,).
 
         Raises:
-            RuntimeError: there are none, or this process was forked from the one that made the worlds.
+            RuntimeError: there is no renderer, or this process was forked from the one that made the worlds.
         """
         self._check_process()
         return self._draw(rows) if self._held is None else self._held.show(rows)
 
     def _draw(self, rows: Tensor | None) -> Tensor:
-        """Draw what `render` returns, if no step has yet."""
+        """Return the images that the last step rendered, or render them now; then add camera noise."""
         if self._images is None:
             images = self.simulator.render(rows)
         elif rows is None:
-            images, self._images = self._images, None  # the caller's from now on
+            images, self._images = self._images, None  # now owned by the caller
         else:
             images = self._images[rows]
         looks = self.simulator.looks
         return images if looks is None else looks.add_noise(images)
 
     def picture(self, position: Tensor, attitude: Tensor) -> Tensor:
-        """Images uint8 (M, height, width, 3) of drones elsewhere: at positions (M, 3), m, with attitudes (M, 4), wxyz.
+        """Return images uint8 (M, height, width, 3) at given positions (M, 3), m, and attitudes (M, 4), wxyz.
 
-        They show the halls of worlds 0, 1, …; the drones that fly stay where they are.
+        They are rendered in the halls of worlds 0, 1, …; the state of the worlds is restored afterwards.
         """
         self._check_process()
         before, state = self.simulator.state_dict(), self.simulator.state
@@ -457,7 +456,7 @@ class RaceWorlds:
         return torch.cat(parts)
 
     def privileged(self) -> dict[str, Tensor]:
-        """Copies of what the pixel agent must not see; see the key table in `docs/api/environments.md`."""
+        """Return copies of the privileged state; see the key table in `docs/api/environments.md`."""
         state = self.simulator.state
         return {
             **{field.name: getattr(state, field.name).to(torch.float32, copy=True) for field in fields(state)},
@@ -466,23 +465,23 @@ class RaceWorlds:
 
     @property
     def effort(self) -> Tensor:
-        """What the last control step asked of the motors, float32 (N, 3), a copy; see `Quadrotor`."""
+        """Motor effort of the last control step, a float32 copy (N, 3); see `Quadrotor`."""
         return self.simulator.quadrotor.effort.to(torch.float32, copy=True)
 
     def vector(self) -> Tensor:
-        """The race in each drone's own frame, float32 (N, 21); see `RaceVector`."""
+        """Return the race vector in each drone's body frame, float32 (N, 21); see `RaceVector`."""
         return self.race_vector(self.simulator.state, self.race.target_gate)
 
     def race_state(self) -> RaceState:
-        """How the race of each drone stands, as functions of one's own are given it: copies."""
+        """Return copies of the state that user-defined functions are given."""
         return self._states(self.simulator.state, self._last_action)
 
     def observed_vector(self) -> Tensor:
-        """What an agent sees under `vector`, float32 (N, V): by a function of one's own, or the race vector."""
+        """Return the observation `vector`, float32 (N, V): the user-defined function's, or the race vector."""
         return self.vector() if self.own_vector is None else self.own_vector.vector(self.race_state())
 
     def state_dict(self) -> dict[str, Any]:
-        """Return all that coming steps and episodes depend on, for `torch.save`."""
+        """Return the complete state that future steps and episodes depend on, for `torch.save`."""
         return {
             "simulator": self.simulator.state_dict(),
             "race": self.race.state_dict(),
@@ -493,10 +492,10 @@ class RaceWorlds:
         }
 
     def load_state_dict(self, state_dict: Mapping[str, Any]) -> None:
-        """Go on as the worlds would that returned this state.
+        """Restore what `state_dict` returned.
 
         Raises:
-            ValueError: they were of another number.
+            ValueError: the saved number of worlds, `camera_rate`, `imu` or device type differs.
         """
         saved = len(state_dict["race"]["target_gate"])
         if saved != self.num_envs:
@@ -534,15 +533,15 @@ class RaceWorlds:
         )
 
     def close(self) -> None:
-        """Free rendering contexts and threads; a forked process has none, and leaves them to the one that made them."""
-        self._graphs.clear()  # they draw into the simulator's buffers
+        """Free rendering contexts and threads; in a forked process they are left to the parent."""
+        self._graphs.clear()  # they write into the simulator's buffers
         self._images = None
         if os.getpid() == self._process:
             self.simulator.close()
 
 
 def _load_parameters(preset: str | QuadrotorParameters, control_rate: float | None) -> QuadrotorParameters:
-    """Return the drone of a preset, with so many actions a second."""
+    """Return the drone parameters of a preset, at a control rate if one is given."""
     parameters = load_preset(preset)
     if control_rate is None:
         return parameters
@@ -551,11 +550,11 @@ def _load_parameters(preset: str | QuadrotorParameters, control_rate: float | No
 
 
 def _check_arguments(num_envs: int, whole: Mapping[str, object]) -> None:
-    """Refuse arguments of a wrong type, before something else fails at them in its own words.
+    """Refuse arguments of a wrong type early, with a clear message.
 
     Args:
         num_envs: N.
-        whole: further ones that must be whole numbers, by name.
+        whole: further arguments that must be whole numbers, by name.
 
     Raises:
         ValueError: the message names the argument, its value and what it must be.

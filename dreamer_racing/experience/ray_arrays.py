@@ -1,7 +1,7 @@
-"""TensorDicts as NumPy arrays, whose memory Ray's object store takes as it is; tensors are pickled one by one.
+"""TensorDicts as NumPy arrays, which Ray's object store takes without copying, while it pickles tensors one by one.
 
-Shapes: N worlds, of one worker where it packs and of all of them where their rollouts are unpacked; T steps a rollout;
-F = first steps, of the N rollouts and of episodes that begin within them.
+Shapes: N environments, of one worker when packing and of all workers when unpacking; T steps per rollout; F first
+steps, of the N rollouts and of episodes that begin within them.
 """
 
 from typing import NamedTuple
@@ -13,11 +13,11 @@ from tensordict.utils import NestedKey
 
 
 class Arrays(NamedTuple):
-    """Entries of a TensorDict; names of its dimensions are lost.
+    """Entries of a TensorDict as arrays; names of its dimensions are lost.
 
     Attributes:
-        batch_size: As of the TensorDict.
-        entries: Arrays by key, those of nested TensorDicts by tuples of keys.
+        batch_size: Batch size of the TensorDict.
+        entries: Arrays by key; keys of nested TensorDicts are tuples.
     """
 
     batch_size: tuple[int, ...]
@@ -25,10 +25,10 @@ class Arrays(NamedTuple):
 
 
 def as_arrays(data: TensorDictBase) -> Arrays:
-    """Take the tensors of a TensorDict for arrays, which on the CPU share their memory where that is contiguous.
+    """Convert the tensors of a TensorDict to arrays, which share the memory of contiguous CPU tensors.
 
     Raises:
-        TypeError: One is of a type that NumPy does not have, such as bfloat16.
+        TypeError: A tensor has a type that NumPy does not have, such as bfloat16.
     """
     tensors = data.data.to("cpu").items(include_nested=True, leaves_only=True)
     return Arrays(tuple(data.batch_size), {key: value.contiguous().numpy() for key, value in tensors})
@@ -41,10 +41,10 @@ def as_tensors(arrays: Arrays) -> TensorDict:
 
 
 def pack_rollout(rollout: TensorDictBase) -> Arrays:
-    """Take a collector's rollout ``[N, T]`` for arrays, in which nothing is sent twice.
+    """Convert a collector's rollout ``[N, T]`` to arrays without duplicate observations.
 
-    What is observed before a step is what was observed after the last one, unless an episode begins. So of entries that
-    are there before steps and after, those before are sent of first steps only: ``(F, ...)`` for ``(N, T, ...)``.
+    The observation before a step equals the one after the step before, unless an episode begins. So root entries that
+    also exist under "next" are only kept for first steps: ``(F, ...)`` instead of ``(N, T, ...)``.
     """
     arrays = as_arrays(rollout)
     first = _first_steps(arrays)
@@ -54,7 +54,7 @@ def pack_rollout(rollout: TensorDictBase) -> Arrays:
 
 
 def unpack_rollout(*parts: Arrays) -> TensorDict:
-    """Make one rollout ``[N, T]`` of those that workers packed, side by side in memory of its own."""
+    """Make one rollout ``[N, T]`` from the packed rollouts of workers, as a copy."""
     batch_size = (sum(part.batch_size[0] for part in parts), *parts[0].batch_size[1:])
     arrays = Arrays(
         batch_size, {key: np.concatenate([part.entries[key] for part in parts]) for key in parts[0].entries}
@@ -70,13 +70,13 @@ def unpack_rollout(*parts: Arrays) -> TensorDict:
 
 
 def _first_steps(arrays: Arrays) -> np.ndarray:
-    """Return where a rollout or an episode begins, bool ``(N, T)``."""
+    """Return the mask of steps at which a rollout or an episode begins, bool ``(N, T)``."""
     first: np.ndarray = arrays.entries["is_init"][..., 0].copy()
     first[:, 0] = True
     return first
 
 
 def _observed_twice(arrays: Arrays) -> list[tuple[NestedKey, NestedKey]]:
-    """List the keys of what is observed before steps and after them, but for `is_init`, by which the two differ."""
+    """List the pairs of keys that exist at the root and under "next", except `is_init`, which really differs."""
     pairs = [(key, ("next", *(key if isinstance(key, tuple) else (key,)))) for key in arrays.entries]
     return [(before, after) for before, after in pairs if after in arrays.entries and before != "is_init"]

@@ -1,6 +1,6 @@
-"""A Ray cluster to collect on: joining it, what it must have, and starting workers there.
+"""Ray cluster for collection: connecting to it, checking its resources and versions, and starting workers.
 
-Everything that a person can mend is refused here, before the first rollout, in a paragraph.
+All mistakes that a user can fix are reported here, before the first rollout.
 """
 
 from __future__ import annotations
@@ -22,38 +22,38 @@ from dreamer_racing.experience.ray_worker import RayWorker, versions
 from dreamer_racing.modules import DreamerPolicy
 from dreamer_racing.settings import COUNT, NOT_NEGATIVE, POSITIVE, setting
 
-if TYPE_CHECKING:  # which imports Ray where it is installed, and that takes a second
+if TYPE_CHECKING:  # it imports Ray, which takes a second
     from torchrl.collectors.distributed import RayCollector
 
 logger = logging.getLogger(__name__)
 
 SEEDS_APART = 1_000_000
-"""Between the seeds of two workers."""
-KNOCK, TRY = 5.0, 120.0  # s to wait for an answer of a cluster's head, and of each node that a worker can be had there
+"""Difference between the seeds of two workers."""
+KNOCK, TRY = 5.0, 120.0  # timeouts, s: for a cluster's head to answer, and for each node to try out a worker
 
 
 @dataclass
 class WorkersConfig:
     """Workers on a Ray cluster, with `collector=ray`."""
 
-    cpus: float = setting(1.0, POSITIVE)  # cores of each, may be a part of one; as many threads draw and step worlds
-    gpus: float = setting(0.0, NOT_NEGATIVE)  # of each, a part of one or whole ones; its policy and worlds live there
-    # local: a cluster started on this machine, for this run | auto: one that runs here | host:port of one
+    cpus: float = setting(1.0, POSITIVE)  # CPU cores per worker, also a fraction; its number of simulation threads
+    gpus: float = setting(0.0, NOT_NEGATIVE)  # GPUs per worker for policy and environments: a fraction or whole ones
+    # local: start a cluster on this machine for this run | auto: one that already runs here | host:port of a cluster
     address: str = "local"
-    # env_steps that weights are old at most when what was flown with them is learned from; null: two rounds, the least
+    # maximum age of a rollout's weights, env_steps, when it has been learned from; null: two rounds, the minimum
     weight_interval: int | None = setting(None, COUNT)
-    patience: float = setting(600.0, POSITIVE)  # s to wait for a round, before the run is saved and ends
+    patience: float = setting(600.0, POSITIVE)  # seconds to wait for a round before the run is saved and ends
 
     @property
     def device(self) -> str:
-        """Where a worker's policy lives."""
+        """Device of a worker's policy."""
         return "cuda" if self.gpus else "cpu"
 
     def check(self) -> None:
-        """Refuse parts of several GPUs.
+        """Check that ``gpus`` is at most 1 or a whole number.
 
         Raises:
-            ValueError: the message gives the next number that can be.
+            ValueError: It is not; the message gives an allowed number.
         """
         if self.gpus > 1 and self.gpus % 1:
             raise ValueError(
@@ -63,14 +63,14 @@ class WorkersConfig:
 
 
 def join(address: str) -> bool:
-    """Join a Ray cluster, unless this process has joined one already; return whether it did now.
+    """Connect to a Ray cluster, unless this process is connected already; return whether it was connected now.
 
     Args:
-        address: ``local`` starts one on this machine, of all its CPUs and GPUs; ``auto`` is one that runs here already;
-            else that of its head, ``host:port``.
+        address: ``local`` starts a cluster on this machine with all its CPUs and GPUs; ``auto`` is one that already
+            runs here; otherwise the address of its head, ``host:port``.
 
     Raises:
-        ValueError: there is no Ray, or no such cluster, or one of other versions; the message says what was found.
+        ValueError: Ray is not installed, or there is no such cluster, or it has other versions; the message says which.
     """
     if importlib.util.find_spec("ray") is None:
         raise ValueError(
@@ -81,7 +81,7 @@ def join(address: str) -> bool:
 
     if ray.is_initialized():
         return False
-    os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")  # nothing is sent anywhere
+    os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")  # send no usage statistics
     try:
         _knock(address)
         ray.init(address=address, include_dashboard=False, logging_level=logging.WARNING)
@@ -95,21 +95,21 @@ def join(address: str) -> bool:
 
 
 def _knock(address: str) -> None:
-    """Raise ``OSError`` if nobody answers at ``host:port``, where Ray would try for minutes."""
+    """Raise ``OSError`` if nothing answers at ``host:port``; Ray itself would retry for minutes."""
     host, colon, port = address.rpartition(":")
     if colon and port.isdigit() and "/" not in host:
         socket.create_connection((host.strip("[]"), int(port)), KNOCK).close()
 
 
 def leave() -> None:
-    """Part from the cluster; one that `join` started ends."""
+    """Disconnect from the cluster; a cluster that `join` started ends."""
     import ray
 
     ray.shutdown()
 
 
 def resources() -> tuple[list[dict[str, float]], dict[str, float]]:
-    """Return what each node of the cluster has, and what of all of it is free: ``CPU``, ``GPU`` and others."""
+    """Return the resources of each node, and the free resources of the cluster: ``CPU``, ``GPU`` and others."""
     import ray
 
     return [node["Resources"] for node in ray.nodes() if node["Alive"]], ray.available_resources()
@@ -118,16 +118,16 @@ def resources() -> tuple[list[dict[str, float]], dict[str, float]]:
 def check_resources(
     workers: int, share: WorkersConfig, nodes: Sequence[Mapping[str, float]], free: Mapping[str, float]
 ) -> None:
-    """Refuse to wait for what a cluster does not have.
+    """Check that a cluster has the resources for all workers.
 
     Args:
-        workers: how many.
-        share: of each.
-        nodes: resources of each node.
-        free: what of them all nobody uses.
+        workers: Number of workers.
+        share: Resources of each worker.
+        nodes: Resources of each node.
+        free: Free resources of the whole cluster.
 
     Raises:
-        ValueError: the message gives what is needed and what is there.
+        ValueError: It does not; the message gives the needed and the available resources.
     """
     for name, option, each in (("CPU", "workers.cpus", share.cpus), ("GPU", "workers.gpus", share.gpus)):
         there, needed = free.get(name, 0.0), workers * each
@@ -146,7 +146,7 @@ def check_resources(
 
 
 def places(share: WorkersConfig, node: Mapping[str, float]) -> int:
-    """How many workers a node with such resources can have, if nothing else is there.
+    """Return the number of workers that fit on an otherwise empty node.
 
     Example:
         >>> places(WorkersConfig(cpus=2.0, gpus=0.6), {"CPU": 16.0, "GPU": 2.0})  # one on each GPU
@@ -171,22 +171,22 @@ def start_workers(
     frames: int,
     seed: int,
 ) -> RayCollector:
-    """Start workers on the cluster that was joined, as many Ray actors, each a `RayWorker`.
+    """Start workers on the connected cluster, each a Ray actor of class `RayWorker`.
 
     Args:
-        make_env: makes the worlds of one worker, ``[N/W]``, with the keys that the policy reads; can be pickled.
-        policy: what flies them, on the CPU; each worker has a copy.
+        make_env: Makes the environments of one worker, ``[N/W]``, with the keys that the policy reads; picklable.
+        policy: Policy on the CPU; each worker gets a copy.
         workers: W.
-        share: of each.
-        env_device: where its worlds live.
+        share: Resources of each worker.
+        env_device: Device of its environments.
         frames: N/W · T, env_steps of a worker's rollout.
-        seed: worker w draws from ``seed`` + 1,000,000 (w + 1), plus the number of the round it begins with.
+        seed: Worker w is seeded with ``seed`` + 1,000,000 (w + 1) plus the number of its first round.
 
     Returns:
-        TorchRL's collector of them, to be given to `RayRollouts`.
+        TorchRL's collector of the workers, for `RayRollouts`.
 
     Raises:
-        ValueError: there is not enough of something, or a node has other versions, or a worker cannot begin.
+        ValueError: Resources are missing, a node has other versions, or a worker cannot start.
     """
     import ray
     from torchrl.collectors.distributed import RayCollector
@@ -214,15 +214,15 @@ def start_workers(
 
 
 def check_nodes(share: WorkersConfig, make_env: Callable[[], EnvBase], policy: DreamerPolicy) -> None:
-    """Refuse nodes that could not have a worker: Ray would begin one there again and again, without a word.
+    """Check that every node can run a worker; otherwise Ray would silently restart one there again and again.
 
     Args:
-        share: of each worker.
-        make_env: makes its worlds; every node must be able to.
-        policy: what flies them; every node must be able to unpickle it.
+        share: Resources of each worker.
+        make_env: Makes the environments of a worker; every node must be able to run it.
+        policy: Policy; every node must be able to unpickle it.
 
     Raises:
-        ValueError: the message names the node, and what is wrong there.
+        ValueError: A node cannot; the message names the node, and what is wrong there.
     """
     import ray
     from ray.util.scheduling_strategies import NodeAffinitySchedulingStrategy
@@ -251,15 +251,15 @@ def check_nodes(share: WorkersConfig, make_env: Callable[[], EnvBase], policy: D
 
 
 def check_versions(node: str, found: Mapping[str, str | None], here: Mapping[str, str | None]) -> None:
-    """Refuse a node of other versions.
+    """Check that a node has the versions of this process.
 
     Args:
-        node: its name.
-        found: there.
-        here: in this process.
+        node: Name of the node.
+        found: Versions on the node.
+        here: Versions in this process.
 
     Raises:
-        ValueError: the message names the node, and both versions.
+        ValueError: They differ; the message names the node, and both versions.
     """
     if others := [f"{name} {found.get(name)} (here {own})" for name, own in here.items() if found.get(name) != own]:
         raise ValueError(
@@ -269,13 +269,13 @@ def check_versions(node: str, found: Mapping[str, str | None], here: Mapping[str
 
 
 def _try_out(make_env: Callable[[], EnvBase], policy: DreamerPolicy) -> dict[str, str | None]:
-    """Make the worlds of a worker, where the policy could be unpickled, too; return versions."""
+    """Make a worker's environments on a node, after Ray has unpickled the policy there; return the node's versions."""
     make_env().close()
     return versions()
 
 
 def _await_room(workers: int, share: WorkersConfig) -> None:
-    """Check resources, once those of a run that has just ended are back."""
+    """Check resources repeatedly for some seconds, because a run that has just ended may still release some."""
     for left in reversed(range(10)):
         try:
             check_resources(workers, share, *resources())
@@ -288,7 +288,7 @@ def _await_room(workers: int, share: WorkersConfig) -> None:
 
 
 def in_a_line(error: Exception, last: bool = False) -> str:
-    """The first words of an error's message, or its last line, where a traceback ends."""
-    plain = re.sub(r"\x1b\[[0-9;]*m", "", str(error))  # colours
+    """Return the first 300 characters of an error's message, or of its last line, which follows a traceback."""
+    plain = re.sub(r"\x1b\[[0-9;]*m", "", str(error))  # without colour codes
     lines = [line.strip() for line in plain.splitlines() if line.strip()]
     return (lines[-1] if last else " ".join(lines))[:300].rstrip(".") if lines else type(error).__name__

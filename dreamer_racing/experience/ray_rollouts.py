@@ -1,23 +1,23 @@
-"""Collection by workers on a Ray cluster: who flies when, with which weights, and what becomes of it.
+"""Collection by workers on a Ray cluster: scheduling of rounds, transfer of weights, and recovery of lost workers.
 
-TorchRL's `RayCollector` starts the workers and ends them; each is a TorchRL `Collector` (`RayWorker`). Rollouts come,
-and weights go, through Ray's object store. What is here is the order in which that happens.
+TorchRL's `RayCollector` starts and ends the workers; each is a TorchRL `Collector` (`RayWorker`). Rollouts and weights
+go through Ray's object store. This module decides when.
 
-A *round* is a rollout of every worker, side by side one rollout ``[N, T]`` of all worlds: worker w flies worlds
-``w·N/W`` to ``(w + 1)·N/W − 1`` of every round. So whatever takes rollouts (streams of a replay, episodes, an actor
-that learns from what was flown) does not know of workers. One round is under way while the last is learned from, never
-more: workers that are faster wait, and nothing piles up.
+A *round* is one rollout of every worker, concatenated to one rollout ``[N, T]`` of all environments: worker w has
+environments ``w·N/W`` to ``(w + 1)·N/W − 1``. So consumers of rollouts (replay streams, episode statistics, on-policy
+actors) need not know of workers. While the learner uses one round, exactly one more is collected; faster workers wait,
+so rounds never queue up.
 
-A worker whose process dies is begun anew by Ray, wherever there is room, and asked again for what it owes. What it had
-flown of that rollout was never seen; the rollouts of the others stay as they are, and the round is delivered once it is
-whole. So every frame counts once, and none is lost that was delivered. The worlds of the worker begin anew: records,
-episodes and returns know that by ``is_init``.
+If a worker's process dies, Ray restarts it wherever there are resources, and repeats the request. The lost part of its
+rollout was never delivered; the other workers' rollouts are kept, and the round is delivered once it is complete. So
+every frame counts once, and delivered frames are never lost. The restarted worker's environments are reset; records,
+episodes and returns recognise that by ``is_init``.
 
-TorchRL's own loop over Ray's workers and its weight synchronisation are not used, because neither outlives a worker:
-the first ends with the error, and drops what the other workers have under way; `RayWeightSyncScheme` is a process group
-that a worker which was begun anew is no part of.
+TorchRL's own loop over Ray workers and its weight synchronisation are not used, because neither survives the loss of a
+worker: the loop ends with the error and drops the rollouts in progress of other workers; `RayWeightSyncScheme` is a
+process group, which a restarted worker cannot join.
 
-Shapes: N worlds of all W workers, T steps a rollout.
+Shapes: N environments of all W workers, T steps per rollout.
 """
 
 from __future__ import annotations
@@ -42,33 +42,33 @@ if TYPE_CHECKING:
 
 logger = logging.getLogger(__name__)
 
-LOOK = 1.0  # s between looks at whether workers have answered, or the run is to stop
-REMIND = 30.0  # s, after which it is said that workers are waited for
-FAREWELL = 10.0  # s that a run which is to stop waits for the round under way
+LOOK = 1.0  # s between checks whether workers have answered, or the run shall stop
+REMIND = 30.0  # s between log messages about late workers
+FAREWELL = 10.0  # s that a stopping run waits for the round in progress
 
 
 class RayRollouts(Rollouts):
-    """Rounds of rollouts, one ahead of the learner.
+    """Iterator over rounds, which are collected one ahead of the learner.
 
     Args:
-        collector: Of workers, as `start_workers` makes it.
-        policy: The learner's, whose weights are sent.
-        env: Whose attributes are sent with every request, for workers to set in theirs.
-        settings: Which those are, by dotted name.
-        weight_interval: env_steps that weights may be old at most when the last frame flown with them is learned from,
-            this rollout's counted. At least two rounds; new ones are sent no sooner than needed.
-        patience: s to wait for a round.
-        leaves: Whether `close` parts from the cluster.
+        collector: Collector of the workers, from `start_workers`.
+        policy: The learner's policy, whose weights are sent.
+        env: Environment whose attributes are sent with every request, to be set in the workers' environments.
+        settings: Dotted names of these attributes.
+        weight_interval: Maximum age of weights, env_steps, when the last frame collected with them has been learned
+            from, including its own round. At least two rounds; new weights are sent no sooner than needed.
+        patience: Seconds to wait for a round.
+        leaves: Whether `close` disconnects from the cluster.
 
     Attributes:
-        rounds: Delivered so far in the run.
-        lost: How often a worker died in this process's time and another took its place.
-        weights_age: env_steps, of the round delivered last: of its weights.
-        processes: Host and process id of each worker, as of that round.
-        seconds: Of that round, how long the slowest worker flew.
+        rounds: Number of rounds delivered in the run.
+        lost: Number of workers that died and were replaced since this process started.
+        weights_age: Age of the weights of the round delivered last, env_steps.
+        processes: Host and process ID of each worker in that round.
+        seconds: Time that the slowest worker took for that round.
 
     Raises:
-        ValueError: If no weights could be as new as ``weight_interval`` asks.
+        ValueError: If ``weight_interval`` is less than two rounds.
     """
 
     has_worlds = False
@@ -89,20 +89,20 @@ class RayRollouts(Rollouts):
         self._frames = collector.frames_per_batch * len(self._workers)
         check_interval(weight_interval, self._frames)
         self._interval, self._patience, self._leaves = weight_interval, patience, leaves
-        self._asked: list[Any] = []  # references to flights, one of each worker
-        self._weights: Any = None  # a reference
-        self._taken_at = self._flown_with = 0  # env_steps learned from when weights were taken: newest, under way
+        self._asked: list[Any] = []  # Ray references to `Flight`s, one for each worker
+        self._weights: Any = None  # a Ray reference
+        self._taken_at = self._flown_with = 0  # env_steps when weights were taken: newest, of the round in progress
         self._all_flew = self._is_over = False
         self.rounds = self.lost = self.weights_age = 0
         self.processes: list[tuple[str, int]] = []
         self.seconds = 0.0
 
     def __next__(self) -> TensorDictBase:
-        """Return the round that was flown meanwhile, ``[N, T]``, and ask for the next.
+        """Return the round in progress, ``[N, T]``, once it is complete, and request the next.
 
         Raises:
-            WorkerError: It cannot be had.
-            StopIteration: It took too long for a run that is to stop, or one before was given up.
+            WorkerError: A worker failed or did not answer in time.
+            StopIteration: The run shall stop and the round took too long, or an earlier round was abandoned.
         """
         if not self._asked and not self._is_over:
             self._ask(self.rounds)
@@ -114,13 +114,13 @@ class RayRollouts(Rollouts):
         return rollout
 
     def drain(self) -> TensorDictBase | None:
-        """Return the round under way, if there is one and it does not take too long, and ask for no other."""
+        """Return the round in progress, if there is one and it does not take too long; request no other."""
         rollout = self._receive()
         self.rounds += rollout is not None
         return rollout
 
     def metrics(self) -> dict[str, float]:
-        """Return how old the weights of the round were."""
+        """Return the age of the weights of the latest round."""
         return {"collect/weights_age": float(self.weights_age)}
 
     def close(self) -> None:
@@ -131,12 +131,12 @@ class RayRollouts(Rollouts):
             ray_cluster.leave()
 
     def begin_at(self, env_steps: int) -> None:
-        """Go on with a run that has made so many env_steps, in fresh worlds."""
+        """Continue a run that was resumed at ``env_steps``, in freshly reset environments."""
         self.rounds = env_steps // self._frames
         logger.info("workers: their worlds begin anew, at round %d", self.rounds)
 
     def _ask(self, number: int) -> None:
-        """Ask every worker for its rollout of a round, with new weights if those sent would be too old by its end."""
+        """Request a round of every worker, with new weights if those sent before would be too old by its end."""
         import ray
 
         if self._weights is None or (number + 1) * self._frames - self._taken_at > self._interval:
@@ -147,9 +147,9 @@ class RayRollouts(Rollouts):
         self._asked, self._flown_with = [worker.fly.remote(request) for worker in self._workers], self._taken_at
 
     def _receive(self) -> TensorDictBase | None:
-        """Wait for the round under way; None if there is none, or if it is given up because the run is to stop.
+        """Wait for the round in progress; return None if there is none, or if it is abandoned because the run stops.
 
-        What workers have flown of a round that is given up is lost, so that there can be none after it.
+        The frames of an abandoned round are lost, so no round can follow it.
         """
         asked, self._asked = self._asked, []
         self._is_over = self._is_over or bool(asked)
@@ -174,10 +174,10 @@ class RayRollouts(Rollouts):
         return unpack_rollout(*(flight.rollout for flight in flights))
 
     def _wait(self, asked: list[Any]) -> bool:
-        """Wait until every worker has answered; return whether they have, rather than the run is to stop.
+        """Wait until every worker has answered; return False if the run stops and they take too long.
 
         Raises:
-            WorkerError: One has not for too long.
+            WorkerError: A worker has not answered for ``patience`` seconds.
         """
         import ray
 
@@ -201,17 +201,17 @@ class RayRollouts(Rollouts):
 
 
 def _flight(worker: int, asked: Any) -> Flight:
-    """Fetch what a worker answered.
+    """Fetch the answer of a worker.
 
     Raises:
-        WorkerError: It failed, or is lost and does not come back.
+        WorkerError: The worker failed, or is lost and cannot be restarted.
     """
     import ray
 
     try:
         return ray.get(asked)
     except ray.exceptions.RayTaskError as error:
-        logger.error("%s", error)  # with the traceback of over there
+        logger.error("%s", error)  # with the worker's traceback
         raise WorkerError(f"Worker {worker} failed ({ray_cluster.in_a_line(error, last=True)}).") from error
     except ray.exceptions.RayError as error:
         reason = ray_cluster.in_a_line(error, last=True)
@@ -219,14 +219,14 @@ def _flight(worker: int, asked: Any) -> Flight:
 
 
 def check_interval(weight_interval: int, frames: int) -> None:
-    """Refuse weights newer than those of a round that is flown while the one before is learned from.
+    """Check that ``weight_interval`` is at least two rounds, because rounds are collected one ahead of the learner.
 
     Args:
         weight_interval: env_steps.
         frames: env_steps of a round.
 
     Raises:
-        ValueError: the message gives the smallest that is possible.
+        ValueError: It is not; the message gives the minimum.
     """
     if weight_interval < 2 * frames:
         raise ValueError(
@@ -241,7 +241,7 @@ def _listed(workers: Sequence[int]) -> str:
 
 
 def _room() -> str:
-    """What the cluster has, in words."""
+    """Return a description of the free resources of the cluster."""
     nodes, free = ray_cluster.resources()
     total = {name: sum(node.get(name, 0.0) for node in nodes) for name in ("CPU", "GPU")}
     has = ", ".join(f"{free.get(name, 0):g} of {there:g} {name}s" for name, there in total.items() if there)

@@ -1,6 +1,6 @@
-"""What flies in a process of its own, on a Ray cluster.
+"""Worker process that collects rollouts on a Ray cluster.
 
-Shapes: N worlds of all W workers, T steps a rollout.
+Shapes: N environments of all W workers, T steps per rollout.
 """
 
 from __future__ import annotations
@@ -23,12 +23,12 @@ from dreamer_racing.machine import PACKAGES, git_commit
 
 
 class Request(NamedTuple):
-    """All that a rollout depends on, but for the worlds that fly it.
+    """Request for a rollout: everything that it depends on, except the worker's environments.
 
     Attributes:
-        round: Its number in the run, from 0.
-        weights: Where the policy's weights are in Ray's object store, as `Arrays`: a list of one reference, which is
-            not fetched with the request but by who does not have them yet.
+        round: Number of the round in the run, from 0.
+        weights: Reference to the policy's weights in Ray's object store, as `Arrays`; it is in a list so that Ray does
+            not fetch it with the request, but only workers that do not have these weights yet do.
         taken_at: env_steps that the learner had learned from when it took those weights.
         settings: Values for attributes of the environment, by dotted name.
     """
@@ -40,13 +40,13 @@ class Request(NamedTuple):
 
 
 class Flight(NamedTuple):
-    """What a worker answers.
+    """Answer of a worker.
 
     Attributes:
-        rollout: ``[N/W, T]``, packed.
-        began: whether it is the worker's first, of worlds that begin anew.
-        process: host and process id.
-        seconds: that it took, of the worker's time.
+        rollout: Packed rollout ``[N/W, T]``.
+        began: Whether it is the worker's first one, with freshly reset environments.
+        process: Host and process ID.
+        seconds: Time that the worker took for it.
     """
 
     rollout: Arrays
@@ -56,25 +56,25 @@ class Flight(NamedTuple):
 
 
 class RayWorker(Collector):
-    """A TorchRL collector that flies one rollout when asked.
+    """TorchRL collector that collects one rollout on request.
 
-    It does not seed itself before its first rollout, by the round that this is: so a worker that takes the place of
-    another does not fly what that one flew.
+    It is seeded at its first rollout by ``seed`` plus the number of that round, so that a restarted worker does not
+    repeat the rollouts of the one that it replaces.
 
     Args:
-        args: Of `Collector`.
-        seed: Of what it draws, plus the number of the round it begins with.
-        kwargs: Of `Collector`.
+        args: Arguments of `Collector`.
+        seed: Seed of the worker, to which the number of its first round is added.
+        kwargs: Keyword arguments of `Collector`.
     """
 
     def __init__(self, *args: Any, seed: int, **kwargs: Any) -> None:
         super().__init__(*args, **kwargs)
         self._seed = seed
         self._taken_at: int | None = None
-        self._flown: tuple[int, Flight] | None = None  # the last round
+        self._flown: tuple[int, Flight] | None = None  # number and answer of the last round
 
     def fly(self, request: Request) -> Flight:
-        """Fly a rollout; one that was flown already, whose answer Ray lost and asks for again, is given again."""
+        """Collect a rollout; if Ray lost the answer and repeats the request, return the same answer again."""
         if self._flown is not None and self._flown[0] == request.round:
             return self._flown[1]
         start = time.perf_counter()
@@ -95,25 +95,25 @@ class RayWorker(Collector):
         return flight
 
     def _begin(self, seed: int) -> None:
-        """Let all worlds begin anew; the process is this worker's own, and so is its generator."""
+        """Seed and reset all environments; the global generator is this worker's alone, like its process."""
         torch.manual_seed(seed)
         self.set_seed(seed)
         self.reset()
 
     def __bool__(self) -> bool:
-        """Answer Ray, which asks before it reports an error, in place of TorchRL's ``__len__``, which would fail then.
+        """Return True, because Ray evaluates it before it reports an error, when TorchRL's ``__len__`` would fail.
 
-        Ray would take that for the death of the process, and begin it anew, again and again.
+        Ray would take that failure for the death of the process, and restart it again and again.
         """
         return True
 
     def __repr__(self) -> str:
-        """Name the worker, as Ray does before each line that it prints."""
+        """Return the name of the worker, which Ray prints before each line of its output."""
         return f"worker {self.worker_idx}"
 
 
 def versions() -> dict[str, str | None]:
-    """Return what must be the same wherever one agent flies: Python, packages, and this project's commit or version."""
+    """Return the versions that must be equal on all nodes: Python, packages, and this project's commit or version."""
     return {
         "python": platform.python_version(),
         **{name: importlib.metadata.version(name) for name in (*PACKAGES, "ray")},

@@ -1,9 +1,9 @@
-"""Replay of what a collector yields: batches of windows, checkpoints.
+"""Replay buffer of a collector's rollouts: sampling of windows, and checkpoints.
 
-Records live in per-environment streams (`dreamer_racing.experience.streams`).
+Records are stored in one stream per environment (`dreamer_racing.experience.streams`).
 
-Shapes: N streams (= environments), L records a stream, B windows a batch, T records a window or steps a rollout,
-M records of one rollout.
+Shapes: N streams (= environments), L records per stream, B windows per batch, T records per window or steps per
+rollout, M records of one rollout.
 """
 
 from __future__ import annotations
@@ -45,7 +45,7 @@ _FIELD = "{}.zst"
 
 
 class Storage(Enum):
-    """Where replay records live."""
+    """Where replay records are stored."""
 
     tensor = "tensor"
     memmap = "memmap"
@@ -55,20 +55,20 @@ class Storage(Enum):
 class ReplayConfig:
     """The replay buffer."""
 
-    capacity: int = setting(250_000, COUNT)  # records, 12.3 KB each at image_size 64
+    capacity: int = setting(250_000, COUNT)  # records, of 12.3 KB each at image_size 64
     storage: Storage = Storage.tensor  # tensor (memory) | memmap (files)
-    device: str = "auto"  # of storage=tensor: auto takes the learner's if it has room, else cpu
+    device: str = "auto"  # for storage=tensor; auto: the learner's device if it has room, else cpu
 
 
 @dataclass
 class SequenceReplayConfig(ReplayConfig):
     """The replay buffer of a world model."""
 
-    # worlds whose records are never trained on, to measure the model; null: one where four or more fly, else none
+    # environments whose records are never trained on, to evaluate the model; null: 1 if there are at least 4
     held_out: int | None = setting(None, NOT_NEGATIVE)
-    recent_share: float = setting(0.0, SHARE)  # of a batch's windows, drawn from the newest records
-    recent_records: int = setting(20_000, COUNT)  # how many those are
-    # windows go on from stored latents, refreshed at each update, instead of from none; null: where the recipe shortens
+    recent_share: float = setting(0.0, SHARE)  # share of a batch's windows drawn from the newest records
+    recent_records: int = setting(20_000, COUNT)  # number of these newest records
+    # windows start from stored latents, refreshed at each update, instead of initial ones; null: if the recipe shortens
     # windows, as it does for model=auto on CUDA
     context: bool | None = None
 
@@ -76,13 +76,13 @@ class SequenceReplayConfig(ReplayConfig):
 class StreamReplay(TensorDictReplayBuffer):
     """TorchRL replay buffer over streams; build it with `make_replay`.
 
-    ``len(replay)`` is the number of records held; a collector may be given it as its ``replay_buffer``.
+    ``len(replay)`` is the number of records stored; a collector can use it as its ``replay_buffer``.
 
     Args:
-        observation_keys: what of an observation is kept.
-        reward_keys: which rewards are kept.
-        latents: how the policy's latents are kept as each record's ``context``; None: they are not.
-        **kwargs: of `TensorDictReplayBuffer`.
+        observation_keys: Keys of an observation that are stored.
+        reward_keys: Keys of rewards that are stored.
+        latents: Format in which the policy's latents are stored as each record's ``context``; None stores none.
+        **kwargs: Arguments of `TensorDictReplayBuffer`.
     """
 
     _storage: RecordStorage
@@ -105,16 +105,16 @@ class StreamReplay(TensorDictReplayBuffer):
 
     @property
     def num_streams(self) -> int:
-        """N."""
+        """N, the number of streams."""
         return self._writer.num_streams
 
     def extend(self, rollout: TensorDictBase, *, update_priority: bool | None = None) -> Tensor:
-        """Appends a collector's rollout ``[N, T]``; see `records_from_rollout`. Returns the slots, int64 ``(M,)``."""
+        """Append a collector's rollout ``[N, T]``; see `records_from_rollout`. Return the slots, int64 ``(M,)``."""
         records = records_from_rollout(rollout, self.observation_keys, self.reward_keys, self.latents)
         return super().extend(records, update_priority=update_priority)
 
     def _sample(self, batch_size: int) -> tuple[TensorDictBase, dict]:
-        """Draws a batch, its slots among it; TorchRL's own brings those by copies that wait for the device."""
+        """Sample a batch including its slots; TorchRL's own method would copy those synchronously."""
         with self._replay_lock, self._write_lock:
             slots, info = self._sampler.sample(self._storage, batch_size)
             records = self._storage.get(slots)
@@ -123,25 +123,25 @@ class StreamReplay(TensorDictReplayBuffer):
         return self._transformed(records), {}
 
     def refresh(self, slots: Tensor, belief: Tensor, state: Tensor) -> None:
-        """Replaces the context of sampled records by what the world model makes of the records before them now.
+        """Replace the context of sampled records by the world model's current latents of the records before them.
 
         Args:
-            slots: of windows just sampled (``"index"`` of the sample), int64 ``(B, T)``.
-            belief: after each of their records, ``(B, T, D)``.
-            state: likewise, ``(B, T, S)``.
+            slots: Slots of windows just sampled (``"index"`` of the sample), int64 ``(B, T)``.
+            belief: Belief after each of their records, ``(B, T, D)``.
+            state: State after each of their records, ``(B, T, S)``.
 
         Reference: danijar/dreamerv3, ``replay_context`` (latents written back to the replay after each update).
         """
         assert self.latents is not None, "made without latents: there is no context to refresh"
         packed = self.latents.pack(belief[:, :-1], state[:, :-1]).flatten()
-        # Windows may overlap: belief and state are then of the same one.
+        # Windows may overlap: `overwrite` then takes belief and state from the same window.
         self._storage.overwrite(slots[:, 1:].flatten(), TensorDict({CONTEXT: packed}, packed.batch_size))
 
     def held_out(self, num_windows: int, length: int, recent: int | None = None) -> TensorDictBase | None:
-        """Returns windows ``[num_windows, length]`` of records that are never sampled, delivered as samples are.
+        """Return windows ``[num_windows, length]`` of the held-out streams, transformed like samples.
 
-        They are drawn from the newest ``recent`` records of the streams that are held out, by how much has been
-        written. None if there are no such streams, or if those are too short yet.
+        They are drawn from the newest ``recent`` records with a seed that depends on the number of records written.
+        Return None if no streams are held out, or if they are still too short.
         """
         slots = self._sampler.held_out(num_windows, length, recent)
         if slots is None:
@@ -149,9 +149,9 @@ class StreamReplay(TensorDictReplayBuffer):
         return self._transformed(self._storage.get(slots))
 
     def newest(self, length: int) -> TensorDictBase | None:
-        """Returns the newest records of every stream, ``[N, length]``, delivered as samples are.
+        """Return the newest records of every stream, ``[N, length]``, transformed like samples.
 
-        None as long as a stream holds fewer.
+        Return None as long as a stream holds fewer.
         """
         slots = self._sampler.newest(length)
         return None if slots is None else self._transformed(self._storage.get(slots))
@@ -160,19 +160,19 @@ class StreamReplay(TensorDictReplayBuffer):
         return self._transform(records) if self._transform is not None and len(self._transform) else records
 
     def records(self, stream: int) -> TensorDictBase:
-        """Returns all records of one stream, oldest first, untransformed, batch ``[filled]``."""
+        """Return all records of one stream, oldest first, untransformed, batch ``[filled]``."""
         return self._storage.get(self._writer.slots(stream))
 
     def dumps(self, path: str | Path) -> None:
-        """Saves the filled part of every stream, the cursors and the random generator into a folder.
+        """Save the filled part of every stream, the cursors and the random generator into a folder.
 
-        Each field is a file of Zstandard frames, one a stream: drawn images shrink to a twentieth. Plain files are
-        written, not memory maps: on a full disk a map ends the process with a bus error.
+        Each field is a file with one Zstandard frame per stream; rendered images shrink to a twentieth. The files are
+        not memory-mapped, because on a full disk a memory map kills the process with a bus error.
         """
         path = Path(path)
         path.mkdir(parents=True, exist_ok=True)
         fields = []
-        with ThreadPoolExecutor(torch.get_num_threads()) as threads:  # compressing lets go of the interpreter
+        with ThreadPoolExecutor(torch.get_num_threads()) as threads:  # compression releases the GIL
             for number, (key, stored) in enumerate(self._storage.fields() if len(self) else ()):
                 with (path / _FIELD.format(number)).open("wb") as file:
                     frames = threads.map(_compressed, (stored[part] for part in self._filled()))
@@ -183,11 +183,11 @@ class StreamReplay(TensorDictReplayBuffer):
         (path / "replay.json").write_text(json.dumps(state), encoding="utf-8")
 
     def loads(self, path: str | Path) -> None:
-        """Restores what `dumps` saved.
+        """Restore what `dumps` saved.
 
         Raises:
-            ValueError: if the saved streams or records do not have this replay's shape, or are not compressed, as those
-                of older versions were.
+            ValueError: If the saved streams or records do not have this replay's shape, or are uncompressed, as in
+                older versions.
         """
         path = Path(path)
         state = self._read_state(path)
@@ -196,20 +196,20 @@ class StreamReplay(TensorDictReplayBuffer):
         self._rng.set_state(torch.tensor(state["generator"], dtype=torch.uint8))
 
     def deal(self, paths: Sequence[str | Path], skip: int) -> None:
-        """Takes as many streams as this replay has of those that several replays saved, one replay after the other.
+        """Load this replay's number of streams from several saved replays, which are concatenated in their order.
 
-        What they held is dealt anew so, to another number of replays. The random generator stays as it is.
+        So streams can be redistributed to another number of replays. The random generator stays as it is.
 
         Args:
-            paths: of what each saved.
-            skip: streams at the beginning that others take.
+            paths: Folders of the saved replays.
+            skip: Number of streams at the beginning that other replays load.
 
         Raises:
-            ValueError: as ``loads``; also if there are not as many streams.
+            ValueError: As in ``loads``; also if there are too few streams.
         """
         here, wanted, before = self._writer, range(skip, skip + self._writer.num_streams), 0
         streams = {"num_streams": here.num_streams, "stream_length": here.stream_length, "write_count": 0}
-        dealt: list[tuple[Path, dict[str, Any], range, int]] = []  # folder, what it holds, which of it, to where
+        dealt: list[tuple[Path, dict[str, Any], range, int]] = []  # folder, its state, chosen streams, first target
         cursor, filled = list[int](), list[int]()
         for path in map(Path, paths):
             state = self._read_state(path)
@@ -231,7 +231,7 @@ class StreamReplay(TensorDictReplayBuffer):
             self._read_streams(path, state, chosen, first)
 
     def _read_state(self, path: Path) -> dict[str, Any]:
-        """Read what a folder says that it holds; refuse what does not fit here, before anything is restored."""
+        """Read the state of a folder, and check that it fits this replay, before anything is restored."""
         state = json.loads((path / "replay.json").read_text(encoding="utf-8"))
         for field in state["fields"]:
             field["key"] = field["key"] if isinstance(field["key"], str) else tuple(field["key"])
@@ -246,13 +246,13 @@ class StreamReplay(TensorDictReplayBuffer):
         return state
 
     def _read_streams(self, path: Path, state: dict[str, Any], chosen: range, first: int) -> None:
-        """Read some of a folder's streams, to those of this replay that begin at ``first``."""
+        """Read the chosen streams of a folder into this replay's streams from ``first`` on."""
         filled, length = state["streams"]["filled"], self._writer.stream_length
         with ExitStack() as stack:
             files = [
                 stack.enter_context((path / _FIELD.format(number)).open("rb")) for number in range(len(state["fields"]))
             ]
-            frame = sum(count > 0 for count in filled[: chosen.start])  # an empty stream has none
+            frame = sum(count > 0 for count in filled[: chosen.start])  # an empty stream has no frame
             for field, file in zip(state["fields"], files, strict=True):
                 file.seek(sum(field["frames"][:frame]))
             for stream in chosen:
@@ -267,13 +267,13 @@ class StreamReplay(TensorDictReplayBuffer):
                 frame += 1
 
     def _filled(self) -> list[slice]:
-        """The filled slots of each stream: a ring that is not full has never wrapped."""
+        """Return the filled slots of each stream; a ring that is not full has never wrapped around."""
         starts = range(0, self._storage.max_size, self._writer.stream_length)
         pairs = zip(starts, self._writer.filled.tolist(), strict=True)
         return [slice(start, start + count) for start, count in pairs if count]
 
     def _check_fields(self, keys: list[NestedKey], fields: list[dict[str, Any]]) -> None:
-        """Refuse fields that are laid out otherwise than those stored here."""
+        """Check that saved fields have the layout of the stored ones."""
         if any("frames" not in field for field in fields):
             raise ValueError("The saved replay is of an older version, which did not compress it: it cannot be read.")
         layouts = {
@@ -286,7 +286,7 @@ class StreamReplay(TensorDictReplayBuffer):
 
     @staticmethod
     def _check_frames(path: Path, state: dict[str, Any]) -> None:
-        """Refuse files that cannot hold a frame of every stream, before anything is restored."""
+        """Check that every file has the size of a frame for each stream, before anything is restored."""
         streams = sum(filled > 0 for filled in state["streams"]["filled"])
         for number, field in enumerate(state["fields"]):
             file = path / _FIELD.format(number)
@@ -299,12 +299,12 @@ def _dtype(field: dict[str, Any]) -> torch.dtype:
 
 
 def _compressed(records: Tensor) -> bytes:
-    """A frame of the values of one field, by Zstandard's fastest ordinary level."""
+    """Return the values of one field as a Zstandard frame of level 1."""
     return zstandard.compress(records.cpu().contiguous().view(torch.uint8).numpy().data, level=1)
 
 
 def _expanded(frame: bytes, shape: tuple[int, ...], dtype: torch.dtype) -> Tensor:
-    """What `_compressed` made a frame of."""
+    """Return the values in a frame of `_compressed`."""
     try:
         if zstandard.frame_content_size(frame) != math.prod(shape) * dtype.itemsize:
             raise ValueError(f"A frame of the saved replay does not hold {list(shape)} values of {dtype}.")
@@ -321,14 +321,14 @@ def replay_bytes(
     numbers: int = 0,
     latents: LatentFormat | None = None,
 ) -> int:
-    """Returns the size in bytes of a replay of ``capacity`` records (12.3 KB each at 64×64).
+    """Return the size in bytes of a replay of ``capacity`` records (12.3 KB each at 64×64).
 
     Args:
-        capacity: records.
-        image_shape: of ``pixels``.
+        capacity: Number of records.
+        image_shape: Shape of ``pixels``.
         action_size: A.
-        numbers: float32 observed beside the image: ``vector`` and the privileged one.
-        latents: how latents are kept, if they are.
+        numbers: Number of float32 values observed besides the image: ``vector`` and the privileged one.
+        latents: Format of stored latents, if any.
     """
     flags, context = 1 + len(END_KEYS), latents.bytes if latents else 0
     floats = action_size + len(RACE_REWARD_KEYS) + numbers
@@ -354,30 +354,30 @@ def make_replay(
     prefetch: int | None = None,
     latents: LatentFormat | None = None,
 ) -> StreamReplay:
-    """Builds the replay of N streams.
+    """Make the replay buffer of N streams.
 
     Args:
-        capacity: records in all; each stream keeps ``capacity // num_envs``.
+        capacity: Number of records in all; each stream stores ``capacity // num_envs``.
         num_envs: N.
-        batch_size: B, windows a sample (not records, unlike TorchRL's `SliceSampler`).
-        batch_length: T, records a window.
-        device: where samples are delivered.
-        storage_device: in whose memory records are kept; ``device`` if None.
-        scratch_dir: folder in whose files they are kept instead, overwritten; None: nowhere.
-        seed: of the sampler's own generator.
-        transform: applied to samples, for example `RelabelReward`.
-        observation_keys: what of an observation is kept.
-        reward_keys: which rewards are kept.
-        recent_share: share of a sample's windows drawn from the newest records, so that the model soon knows where the
-            policy has come to; the others are drawn from all. Reference: danijar/dreamerv3, ``replay.fracs.recency``.
-        recent_records: how many records in all those are; all if None.
-        held_out: the last streams are kept out of samples, for `StreamReplay.held_out`.
-        prefetch: samples drawn ahead in threads, which hides the transfer to ``device``; they may lack the newest
-            records, and a restored replay then does not continue the same samples.
-        latents: how the policy's latents are kept as each record's ``context``; None: they are not.
+        batch_size: B, windows per sample (not records, unlike TorchRL's `SliceSampler`).
+        batch_length: T, records per window.
+        device: Device of samples.
+        storage_device: Device that stores the records; ``device`` if None.
+        scratch_dir: Folder for memory-mapped files, which are overwritten, instead of memory; None uses memory.
+        seed: Seed of the sampler's own generator.
+        transform: Applied to samples, for example `RelabelReward`.
+        observation_keys: Keys of an observation that are stored.
+        reward_keys: Keys of rewards that are stored.
+        recent_share: Share of a sample's windows drawn from the newest records, so that the model soon learns newly
+            visited states; others are drawn from all. Reference: danijar/dreamerv3, ``replay.fracs.recency``.
+        recent_records: Number of these newest records, over all streams; all if None.
+        held_out: Number of last streams that are never sampled, for `StreamReplay.held_out`.
+        prefetch: Number of samples drawn ahead in threads, which hides the transfer to ``device``; they may lack the
+            newest records, and a restored replay then does not continue the same samples.
+        latents: Format in which the policy's latents are stored as each record's ``context``; None stores none.
 
     Raises:
-        ValueError: if a stream could not hold one window, ``recent_share`` is not a share, or all streams are held out.
+        ValueError: If a stream cannot hold a window, ``recent_share`` is not a share, or all streams are held out.
 
     Example:
         >>> replay = make_replay(capacity=100_000, num_envs=16, batch_size=16, batch_length=64)
@@ -414,7 +414,7 @@ def make_replay(
 
 
 def _stream_length(capacity: int, num_envs: int, batch_length: int) -> int:
-    """Return how many records each stream keeps; refuse streams that could not hold one window."""
+    """Return the number of records per stream; raise ``ValueError`` if a stream cannot hold one window."""
     stream_length = capacity // num_envs
     if stream_length < batch_length:
         raise ValueError(
@@ -425,6 +425,6 @@ def _stream_length(capacity: int, num_envs: int, batch_length: int) -> int:
 
 
 def _delivery(kept_on: torch.device, device: torch.device) -> Callable[[TensorDictBase], TensorDictBase]:
-    """Return what brings samples to a device; copies from pinned memory do not wait for it."""
+    """Return the function that moves samples to a device, asynchronously from pinned memory if possible."""
     pinned = device.type == "cuda" and kept_on.type == "cpu"
     return lambda sample: (sample.pin_memory() if pinned else sample).to(device, non_blocking=pinned)

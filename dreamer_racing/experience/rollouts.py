@@ -1,7 +1,7 @@
-"""What a run learns from: rollouts, one after the other; and the newest of them, as an on-policy actor keeps them.
+"""Source of rollouts, and storage of the newest rollouts for an on-policy actor.
 
-Shape legend: N environments, T steps of a rollout, S steps kept of each environment, A action, F features, P privileged
-numbers.
+Shape legend: N environments, T steps of a rollout, S steps kept of each environment, A action, F features, P width of
+the privileged vector.
 """
 
 from __future__ import annotations
@@ -20,20 +20,20 @@ from dreamer_racing.modules.rssm import join_features
 
 
 class WorkerError(RuntimeError):
-    """Who flies failed, or is gone and does not come back: what is under way is given up, all before was delivered."""
+    """Raised if a worker failed or is lost for good; its rollout is lost, all earlier ones were delivered."""
 
 
 class Rollouts(Iterator[TensorDictBase]):
-    """Rollouts ``[N, T]`` of a collector, each flown when it is asked for; subclasses have the next one under way then.
+    """Iterator over rollouts ``[N, T]`` of a collector, each collected on request; subclasses may collect ahead.
 
-    Who takes them learns from what was delivered before the next ``next()``.
+    The consumer learns from a rollout before it calls ``next()`` again.
 
     Args:
-        collector: What flies, e.g. a TorchRL collector.
+        collector: Source of rollouts, for example a TorchRL collector.
 
     Attributes:
-        has_worlds: Whether the worlds that are flown live in this process, and are saved with the run.
-        stopping: Whether the run is to end: what is under way may be given up if it takes long; settable.
+        has_worlds: Whether the environments live in this process, and are saved with the run.
+        stopping: Function that tells whether the run shall end, so that a slow rollout may be abandoned; settable.
     """
 
     has_worlds = True
@@ -48,31 +48,31 @@ class Rollouts(Iterator[TensorDictBase]):
         return next(self._rollouts)
 
     def metrics(self) -> dict[str, float]:
-        """Return what is to be said of the rollout that was delivered last."""
+        """Return metrics of the latest rollout."""
         return {}
 
     def begin_at(self, env_steps: int) -> None:
-        """Go on with a run that has made so many env_steps."""
+        """Continue a run that was resumed at ``env_steps``."""
 
     def wait(self) -> None:
-        """Wait until nothing under way draws from this process's random numbers; it is delivered as ever."""
+        """Wait until collection in progress no longer draws from this process's random generator; nothing is lost."""
 
     def drain(self) -> TensorDictBase | None:
-        """Return the rollout under way, if there is one, and begin no other: nothing moves until the next ``next()``.
+        """Return the rollout in progress, if any, and start no other before the next ``next()``.
 
-        What a checkpoint holds of replay, environment and collector then belongs together.
+        A checkpoint's states of replay, environment and collector are then consistent.
         """
         return None
 
     def close(self) -> None:
-        """End what is under way; it is not delivered any more."""
+        """Abandon the rollout in progress."""
 
 
 class CollectorState:
-    """What a TorchRL collector carries from rollout to rollout: observations, and the policy's memory.
+    """State that a TorchRL collector carries between rollouts: observations and the policy's recurrent state.
 
     Args:
-        collector: A ``Collector``, whose environment is saved apart.
+        collector: A ``Collector``, whose environment is saved separately.
     """
 
     def __init__(self, collector: Any) -> None:
@@ -80,14 +80,14 @@ class CollectorState:
 
     def state_dict(self) -> dict[str, Any]:
         """Return the step that the next rollout starts from."""
-        # Trajectory numbers are counted anew in every process, and nothing reads them.
+        # Trajectory numbers restart in every process, and nothing reads them.
         return self._collector._carrier.exclude("collector").clone().to_dict()
 
     def load_state_dict(self, state_dict: Mapping[str, Any]) -> None:
-        """Start the next rollout from there.
+        """Restore what ``state_dict`` returned.
 
         Raises:
-            ValueError: if it is of another number of environments.
+            ValueError: If it has another number of environments.
         """
         saved, present = len(state_dict["is_init"]), self._collector._carrier.batch_size[0]
         if saved != present:
@@ -101,24 +101,24 @@ READ: tuple[NestedKey, ...] = (
     "action", "previous_action", "loc", "scale", ("next", "belief"), ("next", "state"), ("next", "reward"),
     ("next", "done"), ("next", "terminated"),
 )  # fmt: skip
-"""What is read of a rollout: `DreamerPolicy` and the environment write it."""
+"""Keys of a rollout that are read; `DreamerPolicy` and the environment write them."""
 
 
 class RolloutStorage:
-    """Keeps whole rollouts of a collector until there are enough steps, with the distribution that acted.
+    """Stores whole rollouts until there are enough steps for an update, with the action distribution of each step.
 
-    The steps begin anew with another number of environments or steps; once they are full, the newest are kept.
+    If the shape of rollouts changes, the storage starts afresh. When it is full, the oldest rollout is dropped.
 
     Args:
         number: Steps to keep, summed over environments; rounded up to whole rollouts.
-        device: Where they are kept.
-        privileged: Whether the simulator's state is kept, too.
+        device: Where they are stored.
+        privileged: Whether to store the simulator's state, too.
 
     Attributes:
-        steps: Kept ones, batch ``[S, N]``, time first: ``features`` that the policy saw; ``action``, clipped;
+        steps: Stored steps, batch ``[S, N]``, time first: ``features`` that the policy saw; ``action``, clipped;
             ``previous_action``; ``behavior``, mean and standard deviation side by side; ``reward``, ``done``,
-            ``terminated``; ``privileged``, symlog, if it is kept. None before the first rollout.
-        count: How many of the S are filled.
+            ``terminated``; ``privileged``, symlog, if it is stored. None before the first rollout.
+        count: Number of filled rows, at most S.
     """
 
     def __init__(self, number: int, device: torch.device | str = "cpu", privileged: bool = False) -> None:
@@ -126,7 +126,7 @@ class RolloutStorage:
         self.device = torch.device(device)
         self.keys: tuple[NestedKey, ...] = (*READ, PRIVILEGED) if privileged else READ
         self.steps: TensorDictBase | None = None
-        self.count = 0  # a plain number, to be read without waiting for the device
+        self.count = 0  # a Python number, readable without waiting for the device
 
     @property
     def full(self) -> bool:
@@ -135,12 +135,12 @@ class RolloutStorage:
 
     @torch.no_grad()
     def extend(self, rollout: TensorDictBase) -> None:
-        """Keep a rollout ``[N, T]``.
+        """Store a rollout ``[N, T]``.
 
-        Where its worlds begin anew in the midst of an episode, as those of a lost worker do, the step before ends that.
+        If an environment was reset within an episode, as of a lost worker, its last stored step is marked as done.
 
         Raises:
-            KeyError: If it lacks one of ``keys``.
+            KeyError: If the rollout lacks one of ``keys``.
         """
         if missing := [key for key in self.keys if rollout.get(key, None) is None]:
             raise KeyError(f"The rollout lacks {missing}, which on-policy learning needs of policy and environment.")
@@ -148,7 +148,7 @@ class RolloutStorage:
         length = len(steps)
         kept = self._make_room(steps)
         first = self.count
-        if first == len(kept):  # full, and nothing has learned from it: the oldest rollout makes room
+        if first == len(kept):  # full, and not yet used: drop the oldest rollout
             first -= length
             kept[:first] = kept[length:].clone()
         if first and (begins := rollout.get("is_init", None)) is not None:
@@ -157,11 +157,11 @@ class RolloutStorage:
         self.count = first + length
 
     def clear(self) -> None:
-        """Begin anew; the steps stay readable until the next rollout comes."""
+        """Empty the storage; the steps stay readable until the next ``extend``."""
         self.count = 0
 
     def state_dict(self) -> dict[str, Any]:
-        """Return the steps that are filled, and how many there is room for."""
+        """Return the filled steps and the capacity."""
         if self.steps is None:
             return {"room": 0, "steps": {}}
         return {"room": len(self.steps), "steps": self.steps[: self.count].to_dict()}
@@ -176,7 +176,7 @@ class RolloutStorage:
             self.steps[: self.count] = filled
 
     def _read(self, rollout: TensorDictBase) -> TensorDictBase:
-        """Return what is kept of the steps of a rollout ``[T, N]``."""
+        """Return the stored entries of a rollout ``[T, N]``."""
         after = rollout["next"]
         kept = {
             "features": join_features(after["belief"], after["state"]),
@@ -190,12 +190,12 @@ class RolloutStorage:
         return TensorDict(kept, rollout.batch_size)
 
     def _make_room(self, steps: TensorDictBase) -> TensorDictBase:
-        """Return room for ``number`` steps in whole rollouts like this; what is kept of other shapes is forgotten."""
+        """Return storage for ``number`` steps in whole rollouts of this shape; steps of other shapes are dropped."""
         length, environments = steps.batch_size
         room = length * math.ceil(self.number / (length * environments))
         if self.steps is None or self.steps.batch_size != (room, environments):
             self.steps = steps.new_zeros(room, environments)
             self.count = 0
-        elif self.count % length:  # rollouts of another length, which do not make whole ones of this
+        elif self.count % length:  # the stored rollouts have another length
             self.count = 0
         return self.steps

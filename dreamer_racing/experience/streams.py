@@ -1,12 +1,12 @@
-"""Streams of records, one an environment: how they are made of rollouts, where they lie, which windows are drawn.
+"""Streams of replay records, one per environment: conversion of rollouts, storage, writer and window sampler.
 
-A record is of an observation; its layout is the table of ``docs/api/training.md``. Every environment owns one
-*stream*, a ring of the newest ``L`` records. The storage is flat, ``slot = stream · L + position``, so that a write
-is one indexed copy per key and a window one gather per key. A window may cross the end of an episode (the RSSM resets
-wherever ``is_init``) but never a stream's write head.
+There is one record per observation; its layout is the table of ``docs/api/training.md``. Every environment has one
+*stream*, a ring buffer of the newest ``L`` records. The storage is flat, ``slot = stream · L + position``, so that a
+write is one indexed copy per key, and a window one gather per key. A window may cross the end of an episode (the RSSM
+resets wherever ``is_init``), but never a stream's write head.
 
-Shapes: N streams (= environments), L records a stream, B windows a batch, T records a window or steps a rollout, M
-records of one rollout.
+Shapes: N streams (= environments), L records per stream, B windows per batch, T records per window or steps per
+rollout, M records of one rollout.
 
 Reference: danijar/dreamerv3 (embodied/core/replay.py) for windows over a stream regardless of episode ends.
 """
@@ -28,9 +28,9 @@ from torchrl.data.replay_buffers import RandomSampler, Storage, Writer
 from dreamer_racing.modules.rssm import CONTEXT, LatentFormat
 
 RACE_REWARD_KEYS = ("reward", "reward_base", "body_rate_norm")
-"""The reward of a race and the terms of which `RelabelReward` recomputes it."""
+"""Keys of a race's reward and of the terms from which `RelabelReward` recomputes it."""
 END_KEYS = ("terminated", "truncated")
-"""How an episode may end."""
+"""Keys of the flags that end an episode."""
 
 
 def records_from_rollout(
@@ -39,28 +39,28 @@ def records_from_rollout(
     reward_keys: Sequence[str] = RACE_REWARD_KEYS,
     latents: LatentFormat | None = None,
 ) -> TensorDictBase:
-    """Converts what a TorchRL collector yields into replay records.
+    """Convert a TorchRL collector's rollout to replay records.
 
-    Every transition gives one record, of the observation it arrived at; every root with ``is_init`` gives one more,
-    of the first observation of its episode. An episode of K steps therefore leaves K + 1 records.
+    Every transition gives a record of the observation it leads to; every root with ``is_init`` gives another record, of
+    the first observation of its episode. An episode of K steps therefore has K + 1 records.
 
     Args:
-        rollout: batch ``[N, T]`` (further leading dimensions, as of a multi-process collector, are flattened into N)
+        rollout: Batch ``[N, T]`` (further leading dimensions, as of a multi-process collector, are flattened into N)
             with root keys ``action``, ``is_init`` and the observations, and ``("next", ...)`` keys of the
             observations, the rewards, ``terminated``, ``truncated``.
-        observation_keys: what of an observation is kept.
-        reward_keys: which rewards are kept.
-        latents: how the policy's latents are kept as each record's ``context``: what it had in mind before it saw the
-            record's observation. None: they are not.
+        observation_keys: Keys of an observation that are stored.
+        reward_keys: Keys of rewards that are stored.
+        latents: Format in which the policy's latents before a record's observation are stored as its ``context``; None
+            stores none.
 
     Returns:
-        Records, batch ``[M]`` with M = N·T + number of first observations, first all arrivals, then all first
-        observations. Beside the record's own keys: ``stream`` int64 ``(M,)``, the environment, and ``order`` int64
-        ``(M,)``, how many of these records precede it in its stream. Stored records carry neither.
+        Records, batch ``[M]`` with M = N·T + number of first observations: first those of all transitions, then those
+        of all first observations. Additional keys, which are not stored, are ``stream`` int64 ``(M,)``, the
+        environment, and ``order`` int64 ``(M,)``, the number of these records that precede it in its stream.
 
     Raises:
-        KeyError: if the rollout lacks a key.
-        ValueError: if the rollout has no time dimension.
+        KeyError: If the rollout lacks a key.
+        ValueError: If the rollout has no time dimension.
     """
     _check_rollout(rollout, observation_keys, reward_keys, latents)
     steps = rollout.shape[-1]
@@ -68,7 +68,7 @@ def records_from_rollout(
     is_init = flat["is_init"].reshape(-1)
     first = is_init.nonzero().squeeze(-1)  # (K,)
     stream = torch.arange(len(flat), device=is_init.device) // steps  # (N·T,)
-    # Records up to and including each arrival, over all streams, less those of the streams before.
+    # Number of records up to and including each transition's, over all streams, minus those of earlier streams.
     count = (1 + is_init.long()).cumsum(0)
     before = torch.nn.functional.pad(count[steps - 1 :: steps], (1, 0))[stream]  # (N·T,)
     order = count - before - 1
@@ -105,19 +105,19 @@ def _check_rollout(
 
 
 def _rows(tensor: Tensor) -> Tensor:
-    """Views records ``(M, ...)`` as rows of 8-byte words ``(M, W)`` where their size allows it.
+    """View records ``(M, ...)`` as rows of 8-byte words ``(M, W)`` if their size is a multiple of 8 bytes.
 
-    Torch indexes element by element: an image copied as words instead of bytes takes a quarter of the time.
+    Torch indexes element by element, so copying an image as words instead of bytes takes a quarter of the time.
     """
     rows = tensor.as_subclass(Tensor).contiguous().flatten(1)
     return rows.view(torch.int64) if rows.shape[1] * rows.element_size() % 8 == 0 else rows
 
 
 def check_layout(key: NestedKey, new: Tensor, stored: Tensor) -> None:
-    """Refuse values ``(M, ...)`` of another type or shape than those stored ``(N·L, ...)``.
+    """Check that new values ``(M, ...)`` have the type and shape of the stored ones ``(N·L, ...)``.
 
     Raises:
-        ValueError: the message gives both.
+        ValueError: They do not; the message gives both layouts.
     """
     layout, expected = ((value.dtype, list(value.shape[1:])) for value in (new, stored))
     if layout != expected:
@@ -125,40 +125,40 @@ def check_layout(key: NestedKey, new: Tensor, stored: Tensor) -> None:
 
 
 def send(tensor: Tensor, device: torch.device) -> Tensor:
-    """Return a tensor on a device; what goes to a CUDA device goes from pinned memory, and the CPU does not wait."""
+    """Return a tensor on a device; copies from the CPU to CUDA are asynchronous, through pinned memory."""
     if device.type == "cuda" and tensor.device.type == "cpu":
         return tensor.contiguous().pin_memory().to(device, non_blocking=True)
     return tensor.to(device)
 
 
 class RecordStorage(TensorStorage):
-    """Indexed copies of whole records, over slots of which any may be filled; its length is how many are."""
+    """Storage of records in slots that may be filled in any order; its length is the number of filled slots."""
 
     _named: Tensor | None = None  # int64 (N·L,), −1 between calls of `_last_of`
 
     def fields(self) -> Iterator[tuple[NestedKey, Tensor]]:
-        """Yields what a record has: key and values of all slots ``(N·L, ...)``. Nothing before the first write."""
+        """Yield key and values of all slots ``(N·L, ...)`` for each field; nothing before the first write."""
         if self.initialized:
             yield from self._storage.items(include_nested=True, leaves_only=True)
 
     def set_length(self, filled: int) -> None:
-        """Takes note of how many slots are filled."""
+        """Set the number of filled slots."""
         self._len = filled
 
     def set(self, cursor: Tensor | slice, data: TensorDictBase, *, set_cursor: bool = True) -> None:
-        """Writes records ``[M]`` to slots ``(M,)``; the first write allocates."""
+        """Write records ``[M]`` to slots ``(M,)``; the first write allocates the storage."""
         if not self.initialized:
             self._init(data[0])
         self._write(cursor, data, dict(self.fields()))
 
     def overwrite(self, slots: Tensor, data: TensorDictBase) -> None:
-        """Replaces some fields, data ``[M]``, of the records in slots ``(M,)``; of a slot named twice, by the last."""
+        """Replace some fields of the records in slots ``(M,)`` by data ``[M]``; the last entry of a slot counts."""
         slots = send(slots, self.device)
         data = data[send(self._last_of(slots), data.device or self.device)]
         self._write(slots, data, {key: stored for key, stored in self.fields() if key in data.keys(True, True)})
 
     def _last_of(self, slots: Tensor) -> Tensor:
-        """Return where each of the slots ``(M,)`` is named for the last time, int64 ``(M,)``, without waiting."""
+        """Return the index of the last occurrence of each slot in ``(M,)``, int64 ``(M,)``, without synchronising."""
         if self._named is None:
             self._named = torch.full((self.max_size,), -1, device=slots.device)
         place = torch.arange(len(slots), device=slots.device)
@@ -177,7 +177,7 @@ class RecordStorage(TensorStorage):
         self._bump_mutation_revision()
 
     def get(self, index: Tensor | slice) -> TensorDictBase:
-        """Returns copies of the records in slots of any shape, or those of a slice themselves."""
+        """Return copies of the records in slots of any shape, or a view of those in a slice."""
         if not isinstance(index, Tensor):
             return self._storage[index]
         index = send(index, self.device)
@@ -189,17 +189,17 @@ class RecordStorage(TensorStorage):
 
 
 class StreamTensorStorage(RecordStorage, LazyTensorStorage):
-    """Streams in memory, on any device; allocated at the first write."""
+    """Record storage in memory, on any device; allocated at the first write."""
 
 
 class StreamMemmapStorage(RecordStorage, LazyMemmapStorage):
-    """Streams in memory-mapped files; allocated at the first write."""
+    """Record storage in memory-mapped files; allocated at the first write."""
 
 
 class StreamWriter(Writer):
-    """Appends records to the ring of the stream that each belongs to.
+    """Appends records to the ring buffers of their streams.
 
-    The bookkeeping is on the CPU whatever the storage's device: sampling then needs no device synchronisation.
+    Cursors are on the CPU for any storage device, so that sampling needs no device synchronisation.
 
     Args:
         num_streams: N, the number of environments.
@@ -222,20 +222,20 @@ class StreamWriter(Writer):
         self._empty()
 
     def add(self, data: Any) -> int:
-        """Refuse single records."""
+        """Raise ``NotImplementedError``, because only whole rollouts can be added."""
         raise NotImplementedError("Streams grow by whole rollouts: use extend().")
 
     def extend(self, data: TensorDictBase) -> Tensor:
-        """Writes records with one indexed copy per key.
+        """Write records with one indexed copy per key.
 
         Args:
-            data: records ``[M]`` of `records_from_rollout`. Of a stream that receives more than L, the newest L stay.
+            data: Records ``[M]`` of `records_from_rollout`. If a stream receives more than L, the newest L are kept.
 
         Returns:
             Slots, int64 ``(M,)``, on the CPU.
 
         Raises:
-            ValueError: if the rollout is of another number of environments.
+            ValueError: If the rollout has another number of environments.
         """
         stream, order = torch.stack([data["stream"], data["order"]]).cpu()
         if (found := int(stream.max()) + 1) != self.num_streams:
@@ -255,7 +255,7 @@ class StreamWriter(Writer):
         return slots
 
     def slots(self, stream: int) -> Tensor:
-        """Returns the filled slots of one stream, oldest record first, int64 ``(filled,)``."""
+        """Return the filled slots of one stream, oldest record first, int64 ``(filled,)``."""
         age = torch.arange(int(self.filled[stream])) - self.filled[stream]
         return stream * self.stream_length + (self.cursor[stream] + age) % self.stream_length
 
@@ -276,10 +276,10 @@ class StreamWriter(Writer):
         }
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
-        """Restores the cursors.
+        """Restore the cursors.
 
         Raises:
-            ValueError: if the state is of other streams than this writer's.
+            ValueError: If the state has another number or length of streams.
         """
         self.check(state_dict)
         self.cursor = torch.tensor(state_dict["cursor"], dtype=torch.int64)
@@ -288,10 +288,10 @@ class StreamWriter(Writer):
         self._storage.set_length(int(self.filled.sum()))
 
     def check(self, state_dict: dict[str, Any]) -> None:
-        """Refuse the state of other streams than this writer's.
+        """Check that a saved state has the same number and length of streams.
 
         Raises:
-            ValueError: the message gives both.
+            ValueError: It does not; the message gives both.
         """
         saved = (state_dict["num_streams"], state_dict["stream_length"])
         if saved != (self.num_streams, self.stream_length):
@@ -301,23 +301,23 @@ class StreamWriter(Writer):
             )
 
     def dumps(self, path: str | Path) -> None:
-        """Save the bookkeeping as JSON."""
+        """Save the cursors as JSON."""
         Path(path).write_text(json.dumps(self.state_dict()), encoding="utf-8")
 
     def loads(self, path: str | Path) -> None:
-        """Restore the bookkeeping from JSON."""
+        """Restore the cursors from JSON."""
         self.load_state_dict(json.loads(Path(path).read_text(encoding="utf-8")))
 
 
 class StreamSampler(RandomSampler):
-    """Draws windows of T consecutive records inside one stream, uniformly over all such windows or the newest of them.
+    """Samples windows of T consecutive records of one stream, uniformly over all such windows or the newest ones.
 
     Args:
-        writer: whose streams are sampled.
+        writer: Writer of the sampled streams.
         batch_length: T.
-        recent_share: share of a batch's windows that lie in the newest records of their streams.
-        recent_length: how many records of each stream those are, at least T.
-        held_out: the last streams are never sampled.
+        recent_share: Share of a batch's windows that are drawn from the newest records of the streams.
+        recent_length: Number of these newest records per stream, at least T.
+        held_out: Number of last streams that are never sampled.
     """
 
     def __init__(
@@ -336,12 +336,12 @@ class StreamSampler(RandomSampler):
         self._held_out = torch.arange(writer.num_streams) >= writer.num_streams - held_out  # (N,)
 
     def sample(self, storage: Storage, batch_size: int) -> tuple[Tensor, dict]:
-        """Returns the slots of ``batch_size`` windows, int64 ``(B, T)`` on the CPU, and which are among the newest.
+        """Return the slots of ``batch_size`` windows, int64 ``(B, T)`` on the CPU, and ``{"recent": bool (B, T)}``.
 
-        The latter as ``{"recent": bool (B, T)}``, which a replay delivers with the records.
+        ``recent`` marks windows that were drawn from the newest records; a sample of the replay includes it.
 
         Raises:
-            RuntimeError: if no stream holds T records yet.
+            RuntimeError: If no stream holds T records yet.
         """
         filled = self.writer.filled.masked_fill(self._held_out, 0)  # (N,)
         if not self._sampleable_count(storage, batch_size):
@@ -357,9 +357,9 @@ class StreamSampler(RandomSampler):
         return torch.cat(slots), {"recent": is_recent.unsqueeze(-1).expand(-1, self.batch_length)}
 
     def held_out(self, num_windows: int, length: int, recent: int | None = None) -> Tensor | None:
-        """Returns the slots of windows in the streams that are held out, or None; see `StreamReplay.held_out`.
+        """Return the slots of windows in the held-out streams, or None; see `StreamReplay.held_out`.
 
-        Which they are depends on what has been written alone: looking more or less often changes nothing.
+        The seed is the number of records written, so the number of earlier calls does not matter.
         """
         reach = self.writer.filled.masked_fill(~self._held_out, 0)  # (N,)
         reach = reach if recent is None else reach.clamp(max=recent)
@@ -369,7 +369,7 @@ class StreamSampler(RandomSampler):
         return self._draw(num_windows, length, reach, generator)
 
     def newest(self, length: int) -> Tensor | None:
-        """Returns the slots of each stream's newest records, int64 ``(N, length)``, or None if one holds fewer."""
+        """Return the slots of each stream's newest records, int64 ``(N, length)``, or None if one holds fewer."""
         if int(self.writer.filled.min()) < length:
             return None
         writer = self.writer
@@ -377,10 +377,10 @@ class StreamSampler(RandomSampler):
         return torch.arange(writer.num_streams).unsqueeze(-1) * writer.stream_length + position
 
     def _draw(self, count: int, length: int, reach: Tensor, generator: torch.Generator | None) -> Tensor:
-        """Slots ``(count, length)`` of windows in the newest ``reach`` records ``(N,)`` of the streams."""
+        """Draw the slots ``(count, length)`` of windows in the newest ``reach`` records ``(N,)`` of the streams."""
         writer = self.writer
         windows = (reach - length + 1).clamp(min=0)  # (N,)
-        ends = windows.cumsum(0)  # (N,) windows in the streams up to each
+        ends = windows.cumsum(0)  # (N,) number of windows in all streams up to this one
         window = torch.randint(int(ends[-1]), (count,), generator=generator)
         stream = torch.searchsorted(ends, window, right=True)
         start = writer.cursor[stream] - reach[stream] + window - (ends - windows)[stream]

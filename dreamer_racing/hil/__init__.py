@@ -1,5 +1,5 @@
-"""Flies an exported actor on a real vehicle, or one that is simulated in a process of its own; no torch in here.
+"""Flies an exported actor on a real vehicle, or on one simulated in a separate process, without importing torch.
 
-Poses come in, images are rendered from them, the actor turns images into setpoints, safety has the last word, a link
-carries what is left of it: `pose` → `camera` → `chain` (actor, `safety`) → `sticks` → `links`. See docs/hil.md.
+Poses arrive, images are rendered from them, the actor turns images into setpoints, safety checks and limits these, and
+a link sends the result: `pose` → `camera` → `chain` (actor, `safety`) → `sticks` → `links`. See docs/hil.md.
 """

@@ -1,4 +1,4 @@
-"""What must not hold up a flight, done beside it: disks stall, and terminals are stopped with Ctrl+S."""
+"""A background thread for work that must not delay a flight: disks stall, and Ctrl+S stops terminals."""
 
 from __future__ import annotations
 
@@ -8,13 +8,13 @@ from threading import Thread
 
 
 class Aside:
-    """Does one thing after the other in a thread of its own; who asks for it never waits.
+    """Runs tasks one after another in a background thread; the caller never waits.
 
     Args:
-        most: Things that may wait.
+        most: Largest number of queued tasks.
 
     Attributes:
-        error: What the first thing raised that failed, if one did; nothing is done after it.
+        error: Exception of the first task that failed, if any; no task runs after it.
 
     Example:
         >>> done = []
@@ -27,10 +27,10 @@ class Aside:
         self.error: Exception | None = None
         self._most, self._closed = most, False
         self._waiting: SimpleQueue[Callable[[], object] | None] = SimpleQueue()
-        self._thread: Thread | None = None  # begun with the first thing to do: what forks before has no thread to lose
+        self._thread: Thread | None = None  # started with the first task, so that a fork before that loses no thread
 
     def do(self, thing: Callable[[], object]) -> bool:
-        """Have something done; return whether it will be: not so if too much waits, one failed, or it is closed."""
+        """Queue a task; return whether it was accepted: not if the queue is full, a task failed, or this is closed."""
         if self.error is not None or self._closed or self._waiting.qsize() >= self._most:
             return False
         if self._thread is None:
@@ -40,7 +40,7 @@ class Aside:
         return True
 
     def close(self, patience: float) -> bool:
-        """Wait for what was asked for, so many s at most; return whether all of it is done."""
+        """Wait at most ``patience`` s for the queued tasks; return whether all of them are done."""
         self._closed = True
         if self._thread is None:
             return True

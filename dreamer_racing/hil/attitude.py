@@ -1,4 +1,4 @@
-"""Attitudes as quaternions, wxyz, body → world: turned, compared, and as matrices; in numpy, one at a time."""
+"""Functions on single attitude quaternions (wxyz, body → world): product, rotation, difference and matrix."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from collections.abc import Sequence
 import numpy as np
 
 Numbers = Sequence[float] | np.ndarray
-"""Of a quaternion, (4,) wxyz."""
+"""A quaternion, (4,) wxyz."""
 
 
 def product(first: Numbers, second: Numbers) -> tuple[float, ...]:

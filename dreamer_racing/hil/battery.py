@@ -1,4 +1,4 @@
-"""The battery's voltage, from what the vehicle sends back: for the thrust map, which reckons with it.
+"""Tracks the battery's voltage from telemetry, for the thrust map.
 
 There is no clock and no I/O in here: the same readings give the same voltages, so a recorded flight can be played back.
 """
@@ -13,7 +13,7 @@ from typing import NamedTuple
 from dreamer_racing.settings import ALLOWED, POSITIVE, Range, check_settings, setting
 
 STALE = 2.0
-"""s without a plausible reading after which the voltage counts as old [choice]; it stays what it was."""
+"""s without a plausible reading after which the voltage counts as old [choice]; it keeps its value."""
 
 
 class Reading(NamedTuple):
@@ -30,13 +30,13 @@ class Reading(NamedTuple):
 
 @dataclass(frozen=True, kw_only=True)
 class BatteryConfig:
-    """What is known of a battery before it is heard, and what is believed of what is heard.
+    """A battery's expected voltage, and how readings of it are checked and smoothed.
 
     Attributes:
-        voltage: V, until the first reading.
-        tolerance: Share of ``voltage`` by which a reading may differ from it; beyond it, it is no reading of this
-            battery, but of one cell, say.
-        smoothing: s, time constant of a low-pass: what counts is the battery in a flight, not in a punch.
+        voltage: V, assumed until the first reading.
+        tolerance: Share of ``voltage`` by which a reading may differ from it; one that differs more is rejected, as it
+            may be of a single cell.
+        smoothing: s, time constant of a low-pass that smooths out short bursts of throttle.
 
     Raises:
         ValueError: A number is out of its range.
@@ -51,24 +51,24 @@ class BatteryConfig:
 
     @property
     def limits(self) -> tuple[float, float]:
-        """Least and largest voltage that is believed, V."""
+        """Least and largest voltage that is accepted, V."""
         return self.voltage * (1.0 - self.tolerance), self.voltage * (1.0 + self.tolerance)
 
 
 class Battery:
-    """Follows a battery's voltage.
+    """Filters the readings of a battery's voltage.
 
-    The first plausible reading is taken as it is, later ones through the low-pass. Without readings the voltage stays
-    what it was last, at first that of the configuration.
+    The first plausible reading is taken unfiltered, later ones pass the low-pass. Without readings the voltage keeps
+    its last value, initially that of the configuration.
 
     Args:
-        config: What is known of it.
+        config: Expected voltage, tolerance and smoothing.
 
     Attributes:
         voltage: V, now.
-        readings: Plausible ones so far.
-        implausible: Those beyond the tolerance so far, which are left out.
-        age: s from the last plausible one to the last update; infinite before the first.
+        readings: Number of plausible readings so far.
+        implausible: Number of readings beyond the tolerance so far, which are ignored.
+        age: s from the last plausible reading to the last update; infinite before the first.
 
     Example:
         >>> battery = Battery(BatteryConfig(voltage=16.0, smoothing=0.0))
@@ -84,7 +84,7 @@ class Battery:
         self._heard_at: float | None = None
 
     def update(self, now: float, readings: Sequence[Reading]) -> float:
-        """Take in readings, oldest first; return the voltage, V, which is always within `BatteryConfig.limits`."""
+        """Process readings, oldest first; return the voltage, V, which is always within `BatteryConfig.limits`."""
         low, high = self.config.limits
         for time, voltage in readings:
             if low <= voltage <= high:
@@ -98,7 +98,7 @@ class Battery:
         return self.voltage
 
     def _gain(self, time: float) -> float:
-        """Return the low-pass's, exact for a voltage that is constant from one reading to the next."""
+        """Return the low-pass gain, exact for a voltage that is constant from one reading to the next."""
         if self._heard_at is None or self.config.smoothing == 0.0:
             return 1.0
         return -math.expm1(-max(time - self._heard_at, 0.0) / self.config.smoothing)

@@ -1,4 +1,4 @@
-"""What the nose camera would see from a measured pose, in the scene of training."""
+"""Renders the nose camera's image from a measured pose, in the scene of training."""
 
 from __future__ import annotations
 
@@ -16,20 +16,20 @@ from dreamer_racing.hil.vehicle import Pose
 
 
 class NoseCamera:
-    """Draws one image after the other, in the thread that made it.
+    """Renders images of a track, in the thread that created it only.
 
     Args:
-        track: What stands in the hall.
+        track: Track to render.
         camera: The camera that the actor was trained with.
         backend: ``egl``, ``osmesa``, or ``auto`` for the first that works.
 
     Attributes:
-        backend: The one that draws.
+        backend: The one in use.
         camera: As given.
 
     Raises:
         ValueError: There is no such back end.
-        RendererUnavailableError: None works here; the message says why and what would help.
+        RendererUnavailableError: No back end works here; the message says why and what would help.
     """
 
     def __init__(self, track: Track, camera: Camera, backend: str = "auto") -> None:
@@ -68,10 +68,10 @@ class NoseCamera:
 
 
 def camera_of(contract: dict[str, Any]) -> Camera:
-    """Return the camera of a contract.
+    """Return the camera that an actor's contract describes.
 
     Raises:
-        ValueError: The actor sees numbers, not images.
+        ValueError: The contract has no camera: the actor was trained on numbers, not on images.
     """
     described = contract.get("camera")
     if described is None:

@@ -1,7 +1,7 @@
-"""What happens at each tick: poses in, one command out. No clock and no socket in here.
+"""Processes each tick: poses in, one command out. No clock and no socket in here.
 
-`FlightChain.tick` is a function of what came in at this tick and of the ticks before, so that a recorded flight can be
-played through it again: the same file gives the same commands, bit for bit.
+`FlightChain.tick` depends only on the inputs of this tick and of those before, so that a recorded flight can be
+replayed through it: the same file gives the same commands, bit for bit.
 """
 
 from __future__ import annotations
@@ -28,40 +28,40 @@ from dreamer_racing.hil.vehicle import GRAVITY, Pose, Setpoint
 from dreamer_racing.settings import Range, check_setting
 
 LIFT = 1.35
-"""Weights of thrust that the lift off the stand grows to within `SafetyLimits.lift_time` [choice]. It begins at one: a
-vehicle that is as believed rises gently, at 0.2 m/s after a third of a second and 2 to 3 cm, a heavier one later."""
+"""Multiple of the weight to which take-off thrust ramps up within `SafetyLimits.lift_time` [choice]. It starts at 1: a
+vehicle of the assumed mass has risen 2 to 3 cm after a third of a second, at 0.2 m/s; a heavier one rises later."""
 
 LIFT_LEAST, LIFT_MOST = 1.1, 1.5
-"""Weights: less would not be seen in time, and what needs more is another drone than its actor's [choice]."""
+"""Range of the lift, in weights [choice]: less is not seen in time, and a drone that needs more is not its actor's."""
 
 RISE_TIME = 0.04
-"""s for which all poses must show that a vehicle rises before its flyer takes over [choice]: the velocity that follows
-from a jump of 0.1 m, the largest that safety lets pass, has decayed by then (`PoseConfig.smoothing`)."""
+"""s for which all poses must show the vehicle rising before its flyer takes over [choice]: the false velocity after a
+jump of 0.1 m, the largest that safety accepts, has decayed by then (`PoseConfig.smoothing`)."""
 
 RISE_HEIGHT = 0.01
-"""m above its stand at which it must be by then [choice]."""
+"""m above its stand that the vehicle must have reached by then [choice]."""
 
 START_RATE = 2.0
-"""rad/s above which a vehicle has left the start, be it slow still [choice]: racers turn before they move, and an actor
-whose memory begins when it is tilted already has never seen such a start. Noise of estimated rates stays below."""
+"""rad/s above which even a slow vehicle has left the start [choice]: racers turn before they move, and in training no
+episode begins, with empty memory, in a tilted vehicle. Noise of estimated rates stays below."""
 
 
 LATENCY = Range(0, 1)
-"""s, of poses."""
+"""Allowed latency of poses, s."""
 
 
 class ChainConfig(NamedTuple):
-    """What of a flight is more than its flyer and its track.
+    """Settings of a flight besides its flyer and its track.
 
     Args:
-        limits: Of safety.
-        stamping: When poses count as measured.
-        latency: s, from a pose's measurement to its arrival at the least.
-        laps: After which the flight is over and the vehicle is disarmed; None: when the operator says so.
-        arm: Whether it may arm at all.
-        battery: What is known of it, where its voltage comes back and counts; None: nobody asks for it.
-        lift: Weights of thrust, straight up, that are sent at the most until the vehicle is seen to rise; 0: the flyer
-            takes off by itself.
+        limits: Safety limits.
+        stamping: How the measurement times of poses are determined.
+        latency: Least time from a pose's measurement to its arrival, s.
+        laps: Laps after which the flight ends and the vehicle is disarmed; None: the operator ends it.
+        arm: Whether the vehicle may be armed at all.
+        battery: Battery settings, if the link reports a voltage and it is used; None otherwise.
+        lift: Largest upward thrust, in weights, that is sent until the vehicle is seen to rise; 0: the flyer takes off
+            by itself.
     """
 
     limits: SafetyLimits
@@ -74,17 +74,17 @@ class ChainConfig(NamedTuple):
 
 
 class Inputs(NamedTuple):
-    """What came in at a tick.
+    """The inputs of a tick.
 
     Args:
         time: s, by the loop's clock.
         received: Pose packets since the last tick, oldest first.
         operator: What the operator wants.
-        overrun: Deadlines that the tick before missed, as it took longer than its period.
-        voltages: Of the battery since the last tick, oldest first.
-        dropped: Whether the command of the tick before did not go out.
-        imu: What the IMU told since the last tick, oldest first; asked for only if the flyer needs it.
-        refusal: Of the flight controller, see `Tick`.
+        overrun: Deadlines missed because the tick before took longer than its period.
+        voltages: Battery readings since the last tick, oldest first.
+        dropped: Whether the command of the tick before was not sent.
+        imu: IMU samples since the last tick, oldest first; read only if the flyer uses them.
+        refusal: Why the flight controller does not follow commands, see `Tick`.
     """
 
     time: float
@@ -98,19 +98,19 @@ class Inputs(NamedTuple):
 
 
 class Outputs(NamedTuple):
-    """What came of a tick.
+    """The outputs of a tick.
 
     Args:
         verdict: State, command and reasons.
-        setpoint: What the flyer wanted, be it lifted instead; None without a pose, or if it is cut anyway.
-        pose: For which it was chosen: the newest one, extrapolated to the tick.
-        measured: When that was measured, s; not a number without a pose.
-        image: What the flyer saw; None if it has no camera, or was not asked.
+        setpoint: The flyer's, even if the lift is sent instead; None if pose or IMU is missing, or motors are cut.
+        pose: The newest pose, extrapolated to the tick, for which the setpoint was chosen.
+        measured: When that pose was measured, s; NaN without a pose.
+        image: The flyer's input; None if it has no camera, or was not run.
         target_gate: Index of the gate that comes next.
         passes: Gates passed in this flight.
-        render_s: s that drawing the image took; 0 where that of a tick before is still shown.
-        act_s: s that the flyer took.
-        voltage: V, by which the link is to turn thrust into a throttle; None: as it is set.
+        render_s: Rendering time, s; 0 if the image of an earlier tick is still shown.
+        act_s: The flyer's computing time, s.
+        voltage: V, by which the link converts thrust to throttle; None: unchanged.
     """
 
     verdict: Verdict
@@ -126,29 +126,29 @@ class Outputs(NamedTuple):
 
 
 class FlightChain:
-    """Pose → image → flyer → safety.
+    """Runs pose → image → flyer → safety at each tick.
 
-    A flyer's flight begins when its vehicle moves. On the stand it would be shown the first image again and again, and
-    its first action would fly for as many ticks as motion takes to be seen, which no episode of training begins with.
-    So the vehicle is lifted straight up first, ever harder, and the flyer, which is asked all along, is begun anew when
-    it rises. What is not seen to rise is cut after `SafetyLimits.lift_time`.
+    A flyer's flight begins when its vehicle moves. On the stand it would see the first image again and again, and its
+    first action would be repeated until motion is seen, which no episode of training begins with. So the vehicle is
+    first lifted straight up with growing thrust; the flyer runs at each tick, and is reset until the vehicle rises. If
+    no rise is seen within `SafetyLimits.lift_time`, motors are cut.
 
     Args:
-        flyer: Who flies.
-        track: Where.
-        config: The rest.
-        camera: Draws what the flyer sees; None if it needs no image.
+        flyer: Chooses the setpoints.
+        track: Track to fly.
+        config: All other settings.
+        camera: Renders the flyer's images; None if it needs none.
 
     Raises:
-        ValueError: The latency is no time, the camera's frames do not fit the flyer's rate, or the lift lifts nothing,
-            or is more than is sensible or safety lets through.
+        ValueError: The latency is out of range, the camera's frame rate does not fit the flyer's rate, or the lift is
+            not within its range and safety's limits.
 
     Attributes:
-        progress: Which gates were passed.
-        clock: Of the poses.
-        safety: Has the last word.
-        battery: Its voltage; None if nobody asks for it.
-        feels: Whether the flyer needs what the IMU tells.
+        progress: Counts the gates passed.
+        clock: Determines the measurement times of poses.
+        safety: Checks and limits each command.
+        battery: Tracks its voltage; None if that is not used.
+        feels: Whether the flyer needs IMU samples.
     """
 
     def __init__(self, flyer: Flyer, track: Track, config: ChainConfig, camera: NoseCamera | None) -> None:
@@ -160,17 +160,17 @@ class FlightChain:
         self._flyer, self._camera, self._config = flyer, camera, config
         self._frame_interval = 1 if flyer.camera is None else frame_interval(flyer.camera, flyer.rate)
         self.feels = bool(getattr(flyer, "feels", False))
-        self._felt: ImuReading | None = None  # the newest
-        self._image: np.ndarray | None = None  # that is shown; None before the first of a flight
-        self._shown = 0  # ticks for which it has been
+        self._felt: ImuReading | None = None  # newest IMU sample
+        self._image: np.ndarray | None = None  # shown to the flyer; None before a flight's first
+        self._shown = 0  # ticks for which it has been shown
         drawn = None if camera is None else camera.camera
         self._mismatch = None if flyer.camera in (None, drawn) else f"it sees by {flyer.camera}, drawn is {drawn}"
         self._gates_in_all = None if config.laps is None else config.laps * track.num_gates
         self._newest: Pose | None = None
         self._flying = False  # whether the vehicle has been armed and has left the start
         self._lifting = False  # whether the vehicle was being lifted at the last tick
-        self._stand_height = math.inf  # m, of the newest pose before it was
-        self._rises_since = math.inf  # s, measured: the first of the poses in a row by which it rises
+        self._stand_height = math.inf  # m, of the newest pose before the lift
+        self._rises_since = math.inf  # s, measurement time of the first of consecutive rising poses
         most = min(LIFT_MOST, config.limits.thrust_max / GRAVITY)
         if config.lift and not LIFT_LEAST <= config.lift <= most:
             raise ValueError(
@@ -179,7 +179,7 @@ class FlightChain:
             )
 
     def warm_up(self) -> None:
-        """Do once what a tick does, before the first one: libraries take their time then."""
+        """Render and run the flyer once before the first tick, because libraries are slow at first use."""
         level = np.array([1.0, 0.0, 0.0, 0.0])
         start = np.array(self._config.limits.start_position, float)
         self._felt = ImuReading(0.0, np.array((0.0, 0.0, 0.0, 0.0, 0.0, GRAVITY)))
@@ -188,8 +188,8 @@ class FlightChain:
         self._begin()
 
     def tick(self, inputs: Inputs) -> Outputs:
-        """Take in what came, choose, and let safety judge."""
-        if not self._flying:  # each tick is the first of the flight
+        """Process the inputs, let the flyer choose, and let safety decide."""
+        if not self._flying:  # until take-off, each tick is the flight's first
             self._begin()
         poses = [pose for received in inputs.received if (pose := self.clock.read(received)) is not None]
         for pose in poses:
@@ -207,7 +207,7 @@ class FlightChain:
             setpoint=None,
             operator=inputs.operator,
             arm_requested=self._config.arm,
-            # in flight there is no setpoint instead: it holds, then cuts
+            # a silent IMU in flight leaves the setpoint out instead: safety holds, then cuts
             contract_mismatch=self._mismatch if self.safety.armed else self._mismatch or numb,
             loop_overrun=inputs.overrun,
             finish=finish,
@@ -216,7 +216,7 @@ class FlightChain:
             lift=None if self._flying else self._lift(inputs.time),
         )
         findings = self.safety.examine(tick)
-        # What is cut anyway does not wait for drawing and choosing.
+        # If safety cuts anyway, rendering and flyer are skipped.
         setpoint, image, render_s, act_s = self._choose(None if numb or self.safety.cuts(findings) else pose)
         verdict = self.safety.judge(tick._replace(setpoint=setpoint), findings)
         self._lifting = tick.lift is not None and self.safety.lets_through
@@ -227,7 +227,7 @@ class FlightChain:
         return Outputs(verdict, setpoint, pose, measured, image, target, passes, render_s, act_s, voltage)
 
     def _lift(self, now: float) -> Setpoint | None:
-        """Return the lift at a tick, one weight to begin with and ever more; None: the flyer takes off by itself."""
+        """Return the lift's setpoint, which ramps up from one weight; None if unarmed or without a lift."""
         config = self._config
         if not config.lift or not self.safety.armed:
             return None
@@ -236,41 +236,41 @@ class FlightChain:
         return Setpoint(weights * GRAVITY, np.zeros(3))
 
     def _look_for_a_rise(self, pose: Pose) -> None:
-        """Note since when poses show that the vehicle rises, of those that it was lifted in."""
+        """Note since when consecutive poses during the lift show the vehicle rising."""
         if not self._lifting:
             self._stand_height = float(pose.position[2])
         rises = self._lifting and pose.linear_velocity[2] > self._config.limits.start_speed
         self._rises_since = min(self._rises_since, pose.time) if rises else math.inf
 
     def _has_risen(self) -> bool:
-        """Whether the vehicle, which is lifted, has been seen to rise for long enough."""
+        """Return whether the lifted vehicle has been seen to rise for long enough."""
         if self._newest is None or not self._lifting:
             return False
         risen = float(self._newest.position[2]) - self._stand_height
         return self._newest.time - self._rises_since >= RISE_TIME and risen >= RISE_HEIGHT
 
     def _has_moved(self) -> bool:
-        """Whether the vehicle, which is not lifted, has left the start."""
+        """Return whether a vehicle that takes off without the lift has left the start."""
         if self._newest is None or self._config.lift:
             return False
         speed, rate = (float(np.linalg.norm(part)) for part in (self._newest.linear_velocity, self._newest.body_rates))
         return speed > self._config.limits.start_speed or rate > START_RATE
 
     def _choose(self, pose: Pose | None) -> tuple[Setpoint | None, np.ndarray | None, float, float]:
-        """Return setpoint and image, and how long drawing and choosing took, s."""
+        """Return setpoint, image, rendering time and the flyer's time, s."""
         if pose is None:
             return None, None, 0.0, 0.0
         start = time.perf_counter()
         image = self._look(pose)
         drawn = time.perf_counter()
         felt = () if not self.feels or self._felt is None else (self._felt.sample,)
-        act: Callable[..., Setpoint] = self._flyer.act  # of one that feels, with the sample
+        act: Callable[..., Setpoint] = self._flyer.act  # takes the IMU sample, too, if the flyer needs it
         setpoint = act(pose, image, self.progress.target, *felt)
         render_s = 0.0 if self._shown else drawn - start
         return setpoint, image, render_s, time.perf_counter() - drawn
 
     def _feel(self, inputs: Inputs) -> str | None:
-        """Take in what the IMU told; say why the flyer cannot fly by it, None if it can."""
+        """Store the newest IMU sample; return why the flyer cannot use it, None if it can."""
         if inputs.imu:
             self._felt = inputs.imu[-1]
         most = self._config.limits.hold_after
@@ -279,13 +279,13 @@ class FlightChain:
         return None if self.safety.armed else unlike_rest(self._felt.sample)
 
     def _begin(self) -> None:
-        """Begin a flight."""
+        """Reset flyer and progress for a new flight."""
         self._flyer.reset()
         self.progress.reset()
         self._image = None
 
     def _look(self, pose: Pose) -> np.ndarray | None:
-        """Return the image that the flyer is shown, a frame of now or, of a camera that is slower, one of before."""
+        """Return the flyer's image: a new one, or the last one if the camera is slower than the ticks."""
         if self._camera is None:
             return None
         self._shown += 1
@@ -294,7 +294,7 @@ class FlightChain:
         return self._image
 
     def prepare(self) -> None:
-        """Do what the next tick needs and can be done before it, once the command of this one is out."""
+        """Do the part of the next tick that can be done ahead, once this tick's command is sent."""
         self._flyer.prepare()
 
     def close(self) -> None:
@@ -304,7 +304,7 @@ class FlightChain:
 
 
 def describe_inputs(inputs: Inputs) -> dict[str, Any]:
-    """Return what came in as JSON values, from which `read_inputs` makes it again."""
+    """Return a tick's inputs as JSON values, which `read_inputs` reads back."""
     return {
         "time": inputs.time,
         "received": [[received.time, *_numbers(received.packet)] for received in inputs.received],
@@ -318,7 +318,7 @@ def describe_inputs(inputs: Inputs) -> dict[str, Any]:
 
 
 def read_inputs(message: dict[str, Any]) -> Inputs:
-    """Return what came in from what `describe_inputs` made of it; flights of old say less."""
+    """Return a tick's inputs from the values of `describe_inputs`; older recordings lack some."""
     received = []
     for arrived, sequence, stamp, *numbers in message["received"]:
         values = np.array(numbers)
@@ -326,14 +326,14 @@ def read_inputs(message: dict[str, Any]) -> Inputs:
         received.append(Received(arrived, packet))
     voltages = [Reading(*reading) for reading in message.get("voltages", ())]
     operator, dropped = Operator(*message["operator"]), message.get("dropped", False)
-    overrun = int(message["overrun"])  # flights of old say whether
+    overrun = int(message["overrun"])  # older recordings hold a bool
     felt = [ImuReading(arrived, np.array(sample)) for arrived, *sample in message.get("imu", ())]
     refusal = message.get("refusal", "")
     return Inputs(message["time"], received, operator, overrun, voltages, dropped, felt, refusal)
 
 
 def describe_outputs(outputs: Outputs) -> dict[str, Any]:
-    """Return what came of a tick as JSON values, but for how long it took: the same again when it is played back."""
+    """Return a tick's outputs as JSON values, without timings, so that a replay gives the same."""
     command = outputs.verdict.command
     return {
         "state": outputs.verdict.state.value,

@@ -1,4 +1,4 @@
-"""Flights from configuration: what `recipes/hil.py` can be told, what is refused, and the parts that a flight is of."""
+"""Configuration of `recipes/hil.py`: its options, their checks, and the construction of a flight's parts."""
 
 from __future__ import annotations
 
@@ -42,11 +42,11 @@ logger = logging.getLogger(__name__)
 
 PILOT, IDENTIFY = "pilot", "identify"
 PILOT_RATE = 50.0  # Hz
-SIMULATED = ("simulated", "betaflight_sitl")  # links with nobody to hurt
+SIMULATED = ("simulated", "betaflight_sitl")  # links to simulated vehicles, which can hurt nobody
 ARMING = tuple(link for link in BETAFLIGHT if link != "msp_override")  # links that arm by a channel
 OPERATORS = ("keyboard", "udp", "timed")
-MADE_RATES = ("PoseStamped", "VISION_POSITION_ESTIMATE", "ATT_POS_MOCAP")  # messages that have none
-SPARE = 5.0  # s that the flight of actor=identify has beyond its steps, for its take-off
+MADE_RATES = ("PoseStamped", "VISION_POSITION_ESTIMATE", "ATT_POS_MOCAP")  # messages without body rates
+SPARE = 5.0  # s added to the flight of actor=identify for its take-off
 MOST = 1e4  # rad/s: as good as no limit
 
 
@@ -58,72 +58,72 @@ LimitsConfig = make_dataclass(
     ],
     namespace={"__module__": __name__},  # so that it can be pickled
 )
-"""`SafetyLimits` by their names; null: the default, or what the track says."""
+"""The fields of `SafetyLimits`; null: the default, or the track's value."""
 
 
 @dataclass
 class HilConfig:
-    """`recipes/hil.py`."""
+    """Options of `recipes/hil.py`."""
 
-    # pilot, identify (small steps, for recipes/identification.py), an agent that ships by its name, or the path of an
-    # .onnx file or an agent
+    # who flies: pilot (scripted), identify (small steps, for recipes/identification.py), the name of an included agent,
+    # or the path of an .onnx file or of an agent
     actor: str | None = None
-    track: str | None = None  # built-in track, or path to a YAML file; null: what the actor was trained on
+    track: str | None = None  # built-in track, or path to a YAML file; null: the actor's training track
     arm: bool = False  # whether the vehicle may be armed at all
-    laps: int | None = setting(None, Range(1))  # after which it is DISARMED in the air; null: when the operator says so
-    duration: float | None = setting(None, POSITIVE)  # s after arming, at which it is disarmed; null: no end
-    lift: float = LIFT  # weights of thrust, 1.1 to 1.5, that it is lifted with until it rises; 0: the actor takes off
-    patience: float | None = setting(None, POSITIVE)  # s to wait for arming; null: as long as it takes
-    rate: float | None = setting(None, Range(10, 500))  # Hz; null: the actor's own, which is the only one it can have
-    preset: str = "faithful"  # actor=pilot: what it takes the vehicle for, easy | faithful | betaflight
-    run_dir: str | None = None  # null: runs/hil_<track>_<time>
-    replay: str | None = None  # a flight to play through the chain again
-    report: str | None = None  # a flight to draw and to sum up
-    against: str | None = None  # with report=: another flight, or an evaluation's trajectory (CSV), to draw beside it
+    laps: int | None = setting(None, Range(1))  # laps after which it is DISARMED in the air; null: the operator ends it
+    duration: float | None = setting(None, POSITIVE)  # s after arming until it is disarmed; null: no end
+    lift: float = LIFT  # take-off thrust in weights, 1.1 to 1.5, until it rises; 0: the actor takes off by itself
+    patience: float | None = setting(None, POSITIVE)  # s to wait for arming; null: no limit
+    rate: float | None = setting(None, Range(10, 500))  # Hz of the loop; null: the actor's own, the only one it accepts
+    preset: str = "faithful"  # actor=pilot: vehicle model that it assumes, easy | faithful | betaflight
+    run_dir: str | None = None  # output folder; null: runs/hil_<track>_<time>
+    replay: str | None = None  # a recorded flight to replay through the chain
+    report: str | None = None  # a recorded flight to plot and summarise
+    against: str | None = None  # with report=: another flight, or an evaluation's trajectory (CSV), to plot beside it
 
-    pose: str = "udp"  # udp | mavlink | ros2
-    pose_host: str = "127.0.0.1"  # to listen on
+    pose: str = "udp"  # source of poses: udp | mavlink | ros2
+    pose_host: str = "127.0.0.1"  # address to listen on
     pose_port: int = setting(9100, Range(1, 65535))
-    pose_device: str | None = None  # pose=mavlink: a serial port instead
-    pose_baud: int | None = setting(None, Range(1))  # of it; null: 57600
-    pose_topic: str | None = None  # pose=ros2
-    pose_message: str | None = None  # which kind of message; null: ODOMETRY, or PoseStamped
-    smoothing: float = setting(0.01, Range(0, 1))  # s, time constant of velocities where poses come without
-    # a pose's time: receive (arrival less latency) | sender (its stamp); null: receive over UDP, else sender
+    pose_device: str | None = None  # pose=mavlink: a serial port instead of UDP
+    pose_baud: int | None = setting(None, Range(1))  # baud rate of pose_device; null: 57600
+    pose_topic: str | None = None  # pose=ros2: the topic
+    pose_message: str | None = None  # message type; null: ODOMETRY (mavlink), PoseStamped (ros2)
+    smoothing: float = setting(0.01, Range(0, 1))  # s, time constant of velocities estimated from poses that lack them
+    # a pose's time: receive (arrival minus latency) | sender (its timestamp); null: receive over UDP, else sender
     stamping: Stamping | None = None
-    latency: float = setting(0.0, Range(0, 1))  # s from a pose's measurement to its arrival, at the least
+    latency: float = setting(0.0, Range(0, 1))  # least time from a pose's measurement to its arrival, s
 
-    operator: str = "auto"  # keyboard | udp | timed (enables by itself); auto: timed where the link is simulated
-    operator_host: str = "127.0.0.1"  # to listen on
+    operator: str = "auto"  # keyboard | udp | timed (automatic); auto: timed for a simulated link, else keyboard
+    operator_host: str = "127.0.0.1"  # address to listen on
     operator_port: int = setting(PORT, Range(1, 65535))
 
     link: str = "simulated"  # simulated | udp | betaflight_sitl | crsf | sbus | msp | msp_override | mavlink
-    link_host: str = "127.0.0.1"  # to send to
-    link_port: int | None = setting(None, Range(1, 65535))  # null: 9101, or the firmware's own
+    link_host: str = "127.0.0.1"  # address to send to
+    link_port: int | None = setting(None, Range(1, 65535))  # null: 9101, or the firmware's default
     serial_port: int = setting(MSP_PORT, Range(1, 65535))  # link=betaflight_sitl: TCP port of the firmware's MSP
-    device: str | None = None  # serial port
-    baud: int | None = setting(None, Range(1))  # null: the protocol's own
+    device: str | None = None  # serial port of the link
+    baud: int | None = setting(None, Range(1))  # null: the protocol's default
     arm_channel: int = 4  # index of the channel that arms: 4 is AUX1
-    # what the vehicle is, a preset or the file of recipes/identification.py: an actor of another rate loop is refused;
-    # null: a link to a Betaflight arms none that was trained with a proportional one
+    # the vehicle, a preset or a file of recipes/identification.py: an actor trained with another rate loop is refused;
+    # null: a link to a Betaflight arms no actor that was trained with a proportional rate loop
     vehicle: str | None = None
-    force: bool = False  # fly all the same what is refused for its rate loop
-    betaflight_dump: str | None = None  # what `dump all` gave; settings that are not the actor's: nothing is armed
+    force: bool = False  # fly even if the rate loop does not match
+    betaflight_dump: str | None = None  # file with the output of `dump all`; refused if settings are not the actor's
     mass: float | None = setting(None, POSITIVE)  # kg, with battery
     full_thrust: float | None = setting(None, POSITIVE)  # N, of all motors at full command and the reference voltage
-    reference_voltage: float | None = setting(None, POSITIVE)  # V
-    voltage: float | None = setting(None, POSITIVE)  # V, the battery's now; until a link that hears of it says more
+    reference_voltage: float | None = setting(None, POSITIVE)  # V, at which full_thrust was measured
+    voltage: float | None = setting(None, POSITIVE)  # V, the battery's now, until the link reports it
     voltage_tolerance: float = setting(0.25, Range(0, 0.5))  # share of voltage= by which readings may differ from it
-    voltage_smoothing: float = setting(0.5, Range(0, 60))  # s, time constant of the low-pass that readings go through
+    voltage_smoothing: float = setting(0.5, Range(0, 60))  # s, time constant of the low-pass of readings
 
-    limits: Any = field(default_factory=LimitsConfig)  # of safety: limits.speed_max=10; all of them: docs/hil_safety.md
+    limits: Any = field(default_factory=LimitsConfig)  # safety limits, as limits.speed_max=10; see docs/hil_safety.md
     renderer: str = "auto"  # auto | egl | osmesa
     record: bool = True  # write the flight to a file
     view: int | None = setting(None, Range(1, 65535))  # port of a page on this machine that shows what the actor sees
 
 
 def check(config: HilConfig) -> None:
-    """Refuse what does not go together.
+    """Refuse settings that contradict each other.
 
     Raises:
         ValueError: the message names the field and what is allowed.
@@ -162,7 +162,7 @@ def check(config: HilConfig) -> None:
 
 
 def check_read(config: HilConfig) -> None:
-    """Refuse settings that nothing would read, as another link or source of poses is chosen.
+    """Refuse settings that the chosen mode, actor, link or pose source does not use.
 
     Raises:
         ValueError: the message names the setting and what it is for.
@@ -202,14 +202,14 @@ def check_read(config: HilConfig) -> None:
 
 
 def operator_of(config: HilConfig) -> str:
-    """Return who answers for the flight, also where that is left open."""
+    """Return the name of the operator's source, with ``auto`` resolved."""
     if config.operator != "auto":
         return config.operator
     return "timed" if config.link in SIMULATED else "keyboard"
 
 
 def is_this_machine(host: str) -> bool:
-    """Whether an address is one of the loopback; of names only localhost is: others may mean any machine."""
+    """Return whether a host is a loopback address or localhost; any other name may mean another machine."""
     try:
         return ipaddress.ip_address(host).is_loopback
     except ValueError:
@@ -217,14 +217,14 @@ def is_this_machine(host: str) -> bool:
 
 
 def check_flight(config: HilConfig, contract: dict[str, Any], track: Track) -> list[str]:
-    """Refuse to fly where actor, track, limits and flight controller are not of one kind; arming comes after this.
+    """Refuse to fly if actor, track, limits and flight controller do not match; called before arming.
 
     Returns:
-        What was not compared, or is as a person wants it, in words.
+        Notes for a person: what was not compared, and which mismatches the settings allow.
 
     Raises:
-        ValueError: The message names what differs, line by line where settings of the flight controller do.
-        OSError: There is no such dump.
+        ValueError: Something does not match; the message names it, with a line per setting of the flight controller.
+        OSError: The dump's file does not exist.
     """
     found: list[str | None] = []
     if config.actor not in (PILOT, IDENTIFY):
@@ -258,17 +258,17 @@ def check_flight(config: HilConfig, contract: dict[str, Any], track: Track) -> l
 
 
 def given_limits(config: HilConfig) -> dict[str, Any]:
-    """Return the limits of safety that were set."""
+    """Return the safety limits that the user has set."""
     return {name: value for name, value in vars(config.limits).items() if value is not None}
 
 
 def limits_of(config: HilConfig, track: Track) -> SafetyLimits:
-    """Return the limits of safety."""
+    """Return the safety limits of a flight."""
     return SafetyLimits.of_track(track, **tolerances_of(config) | given_limits(config))
 
 
 def pilot_contract(config: HilConfig) -> dict[str, Any]:
-    """Return what an actor's contract would say of the pilot."""
+    """Return the contract that the pilot would have if it were an actor."""
     drone = QuadrotorParameters()
     channels = [
         {"name": f"body_rate_{axis}", "unit": "rad/s", "offset": 0.0, "scale": rate}
@@ -281,7 +281,7 @@ def pilot_contract(config: HilConfig) -> dict[str, Any]:
 
 
 def make_chain(config: HilConfig, flyer: Flyer, track: Track) -> FlightChain:
-    """Make the chain of a flyer."""
+    """Make the flight chain of a flyer."""
     limits = limits_of(config, track)
     settings = ChainConfig(
         limits, stamping_of(config), config.latency, config.laps, config.arm, battery_config(config), config.lift
@@ -291,9 +291,9 @@ def make_chain(config: HilConfig, flyer: Flyer, track: Track) -> FlightChain:
 
 
 def tolerances_of(config: HilConfig) -> dict[str, float]:
-    """Return limits of safety that follow from where poses come from, and from who flies, unless they are given.
+    """Return the safety limits that depend on pose source and flyer; the user's settings override them.
 
-    Body rates that are made from attitudes cannot contradict them, but lag behind. Who hovers is not stranded.
+    Body rates estimated from attitudes only lag behind them, and a hovering vehicle is not stranded.
     """
     made = config.pose_message in MADE_RATES or (config.pose == "ros2" and config.pose_message is None)
     hovers = {"still_time": 3600.0} if config.actor == IDENTIFY else {}
@@ -301,7 +301,7 @@ def tolerances_of(config: HilConfig) -> dict[str, float]:
 
 
 def stamping_of(config: HilConfig) -> Stamping:
-    """Return how poses are stamped: what is read when the loop comes to it looks younger than it is."""
+    """Return how poses are stamped: by arrival only if the kernel stamps packets; others seem newer than they are."""
     if config.stamping is not None:
         return config.stamping
     kernel = config.pose == "udp" or (config.pose == "mavlink" and config.pose_device is None)
@@ -309,7 +309,7 @@ def stamping_of(config: HilConfig) -> Stamping:
 
 
 def link_config(config: HilConfig, contract: dict[str, Any], rate: float) -> LinkConfig:
-    """Return what the link needs: sticks as `dreamer_racing.hil.betaflight` has the flight controller set."""
+    """Return the link's settings, with the stick rates that `dreamer_racing.hil.betaflight` configures."""
     numbers = {name: getattr(config, name) for name in ("mass", "full_thrust", "reference_voltage", "voltage")}
     missing = [name for name, number in numbers.items() if number is None]
     if missing and config.link not in ("simulated", "udp"):
@@ -334,14 +334,14 @@ def link_config(config: HilConfig, contract: dict[str, Any], rate: float) -> Lin
 
 
 def battery_config(config: HilConfig) -> BatteryConfig | None:
-    """Return what is known of the battery; None where nothing more comes to be known."""
+    """Return the battery's settings; None if the link reports no voltage, or none is given."""
     if config.link not in HEARING or config.voltage is None:
         return None
     return BatteryConfig(voltage=config.voltage, tolerance=config.voltage_tolerance, smoothing=config.voltage_smoothing)
 
 
 def check_battery(config: HilConfig, thrust: ThrustMap) -> None:
-    """Refuse to believe voltages that the thrust map cannot reckon with: in flight nothing may be refused.
+    """Refuse a tolerance that accepts voltages beyond the thrust map's range, as nothing can be refused in flight.
 
     Raises:
         ValueError: The message names the setting and the voltage.
@@ -357,7 +357,7 @@ def check_battery(config: HilConfig, thrust: ThrustMap) -> None:
 
 
 def pose_config(config: HilConfig) -> PoseConfig:
-    """Return where poses come from."""
+    """Return the settings of the pose source."""
     return PoseConfig(
         name=config.pose,
         host=config.pose_host,
@@ -371,7 +371,7 @@ def pose_config(config: HilConfig) -> PoseConfig:
 
 
 def make_operator(config: HilConfig) -> OperatorSource:
-    """Open where the operator's word comes from, and say which it is if that was left open."""
+    """Open the operator's source, and log which it is if ``operator=auto``."""
     name = operator_of(config)
     if config.operator == "auto":
         logger.info("operator: %s (operator=auto, link=%s)", name, config.link)

@@ -1,4 +1,4 @@
-"""Who flies: an exported actor that sees images, or whoever else turns a pose into a setpoint."""
+"""Flyers: an exported actor that sees images, or anything else that turns a pose into a setpoint."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from dreamer_racing.hil.safety_limits import SafetyLimits
 from dreamer_racing.hil.vehicle import Pose, Setpoint
 
 TOLERANCE = 0.1
-"""Share by which gains and motors may differ from those of training, beyond the widths of that [choice]."""
+"""Share by which gains and motors may differ from those of training, beyond its randomisation [choice]."""
 
 
 class Flyer(Protocol):
@@ -25,38 +25,38 @@ class Flyer(Protocol):
 
     Attributes:
         rate: Hz, of ticks.
-        camera: Through which it sees; None: it needs no image.
+        camera: The camera it sees through; None: it needs no image.
     """
 
     rate: float
     camera: Camera | None
 
     def reset(self) -> None:
-        """Begin a flight: forget everything before it."""
+        """Begin a flight with empty memory."""
         ...
 
     def act(self, pose: Pose, image: np.ndarray | None, target_gate: int) -> Setpoint:
-        """Choose from where the vehicle is, what it sees if the flyer has a camera, and which gate comes next."""
+        """Choose a setpoint by the pose, the image (None without a camera) and the index of the next gate."""
         ...
 
     def prepare(self) -> None:
-        """Do what the next choice needs and can be done before it: called when a command is on its way."""
+        """Do the part of the next tick that can be done ahead; called after a command was sent."""
         ...
 
 
 class ActorFlyer:
-    """An exported actor: it sees the image, and what the IMU tells if it was trained with one, and nothing else.
+    """An exported actor, whose only inputs are the image and, if it was trained with them, IMU samples.
 
     Args:
-        path: The ``.onnx`` file, or the folder of an agent that ships.
+        path: The ``.onnx`` file, or the folder of an included agent.
 
     Attributes:
-        contract: Of the actor.
-        feels: Whether it must be told what the IMU tells.
+        contract: The actor's contract.
+        feels: Whether it needs IMU samples.
 
     Raises:
-        FileNotFoundError: There is none.
-        ValueError: Its contract is broken, or it sees numbers.
+        FileNotFoundError: There is no such file.
+        ValueError: Its contract is invalid, or it was not trained on images.
         ImportError: onnxruntime is not installed.
     """
 
@@ -72,7 +72,7 @@ class ActorFlyer:
         self._actor.reset()
 
     def act(self, pose: Pose, image: np.ndarray | None, target_gate: int, imu: np.ndarray | None = None) -> Setpoint:
-        """Choose by the image, and by what the IMU tells, (6,)."""
+        """Return the actor's setpoint for the image and, if it uses the IMU, a sample (6,)."""
         assert image is not None, "there is a camera, so there is an image"
         felt = None if imu is None else imu.astype(np.float32)
         thrust, *rates = self._actor.setpoint(self._actor.step(image, imu=felt))
@@ -84,10 +84,10 @@ class ActorFlyer:
 
 
 def trained_track(contract: dict[str, Any]) -> Track:
-    """Return the track that an actor was trained on, as its contract names or, where that was a file, describes it.
+    """Return the track that an actor was trained on, by its name or, if it was a file, its description in the contract.
 
     Raises:
-        TrackError: There is no such track here, or what is described is none.
+        TrackError: There is no such track here, or the description is invalid.
     """
     source = contract["source"]
     if (described := source.get("track_description")) is None:
@@ -96,15 +96,15 @@ def trained_track(contract: dict[str, Any]) -> Track:
 
 
 def check_contract(contract: dict[str, Any], track: Track, rate: float | None = None) -> str | None:
-    """Refuse an actor that was trained for something else than what it is to fly.
+    """Refuse an actor that was trained for another track, rate or image size.
 
     Args:
-        contract: Of the actor.
-        track: On which it is to fly: it must be the one of the contract by its geometry, under whatever name.
-        rate: Hz, of the loop; None for the actor's own.
+        contract: The actor's contract.
+        track: The track to fly; its geometry must be that of the contract, its name may differ.
+        rate: Hz of the loop; None for the actor's own.
 
     Returns:
-        What the contract, an older one, does not say and so was not compared; None if it says all.
+        What was not compared, because an older contract lacks it, in words; None if everything was.
 
     Raises:
         ValueError: The message names the fields that differ, with both values.
@@ -137,15 +137,15 @@ def check_rate_loop(contract: dict[str, Any], vehicle: str, force: bool) -> str 
     """Refuse an actor that was trained with another rate loop than the vehicle has.
 
     Args:
-        contract: Of the actor.
-        vehicle: A preset, or the file of a drone that was identified.
-        force: Whether to fly it all the same.
+        contract: The actor's contract.
+        vehicle: A preset, or the file of an identified drone.
+        force: Whether to fly it anyway.
 
     Returns:
-        What differs, in words, where it is forced; None if nothing does, or the contract, an older one, says nothing.
+        What differs, if forced, or was not compared, in words; None if the rate loops match.
 
     Raises:
-        ValueError: They differ; the message names both. Or there is no such vehicle.
+        ValueError: They differ and ``force`` is false (the message names both), or there is no such vehicle.
     """
     trained, there = _trained_loop(contract), load_preset(vehicle)
     if trained is None:
@@ -157,18 +157,18 @@ def check_rate_loop(contract: dict[str, Any], vehicle: str, force: bool) -> str 
 
 
 def check_flown_by_betaflight(contract: dict[str, Any], link: str, force: bool) -> str | None:
-    """Refuse an actor that was not trained with the rate loop of the flight controllers at the other end of a link.
+    """Refuse an actor that was not trained with Betaflight's rate loop, for a link to a Betaflight.
 
     Args:
-        contract: Of the actor.
-        link: By which a Betaflight is told.
-        force: Whether to fly it all the same.
+        contract: The actor's contract.
+        link: Name of the link.
+        force: Whether to fly it anyway.
 
     Returns:
-        As `check_rate_loop`.
+        What differs, in words, if forced; None if nothing does, or an older contract lacks the rate loop.
 
     Raises:
-        ValueError: It was trained with another one; the message names both.
+        ValueError: It was trained with another one and ``force`` is false; the message names both.
     """
     trained = _trained_loop(contract)
     if trained is None or trained["kind"] == "betaflight":
@@ -178,17 +178,17 @@ def check_flown_by_betaflight(contract: dict[str, Any], link: str, force: bool) 
 
 
 def _trained_loop(contract: dict[str, Any]) -> dict[str, Any] | None:
-    """Return what a contract says of the rate loop of training; of an older one, what its preset had."""
+    """Return the rate loop of training from a contract; if an older one lacks it, that of its preset."""
     preset = contract.get("source", {}).get("preset")
     old = {"kind": "proportional"} if preset in ("easy", "faithful") else None
     return contract.get("rate_loop", old)
 
 
 def _refuse_loop(words: str, remedy: str, force: bool) -> str:
-    """Return what differs in words, where it is forced.
+    """Return a note of what differs if ``force``, else refuse it.
 
     Raises:
-        ValueError: It is not.
+        ValueError: ``force`` is false.
     """
     if force:
         return f"{words}; it flies all the same (force=true)"
@@ -204,7 +204,7 @@ def _name_loop(kind: str) -> str:
 
 
 def _unlike_loop(trained: dict[str, Any], there: QuadrotorParameters) -> tuple[str, str] | None:
-    """Return what a contract says of its rate loop, and what a vehicle has instead; None if it is within its widths."""
+    """Return the first mismatch in words, of the contract's and the vehicle's rate loop; None if within tolerances."""
     kind = "proportional" if there.betaflight is None else "betaflight"
     if trained["kind"] != kind:
         return _name_loop(trained["kind"]), _name_loop(kind)
@@ -226,18 +226,18 @@ def _unlike_loop(trained: dict[str, Any], there: QuadrotorParameters) -> tuple[s
 
 
 def check_ranges(contract: dict[str, Any], limits: SafetyLimits, meant: Collection[str] = ()) -> list[str]:
-    """Refuse an actor that asks for more than safety lets through: what is clipped is not what it chose.
+    """Refuse an actor whose action range exceeds the safety limits, which would clip its actions.
 
     Args:
-        contract: Of the actor.
-        limits: Of safety.
-        meant: Names of limits that a person has set: such a one may clip, and is said.
+        contract: The actor's contract.
+        limits: Safety limits.
+        meant: Names of limits set by the user; these may clip, which is reported.
 
     Returns:
-        What such limits clip, in words.
+        What these limits clip, in words.
 
     Raises:
-        ValueError: A limit that nobody set clips; the message names it, both values, and what to set.
+        ValueError: A limit not set by the user clips; the message names it, both values, and what to set.
     """
     asked = {
         channel["name"]: abs(channel["offset"]) + abs(channel["scale"]) for channel in contract["action"]["channels"]

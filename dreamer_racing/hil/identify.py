@@ -1,7 +1,7 @@
-"""A flight that tells how a vehicle answers: small steps of body rates and thrust about a hover at the start.
+"""The identification flight: small steps of body rates and thrust around a hover at the start.
 
-Nothing here is aggressive: it never tilts by more than about half a radian, and returns to its place after each step.
-What it flew is for `dreamer_racing.identification`.
+The flight is gentle: the vehicle never tilts by more than about half a radian, and returns to its place after each
+step. Its recording is for `dreamer_racing.identification`.
 """
 
 from __future__ import annotations
@@ -17,31 +17,31 @@ from dreamer_racing.hil.attitude import rotation_matrix
 from dreamer_racing.hil.vehicle import GRAVITY, Pose, Setpoint
 
 RATE = 100.0
-"""Hz, of commands: as often as a radio takes them."""
+"""Hz, of commands: as often as a radio accepts them."""
 
 AXES = ("roll", "pitch", "yaw", "thrust")
 AMPLITUDES = {"roll": (1.0, 2.0, 4.0), "pitch": (1.0, 2.0, 4.0), "yaw": (0.7, 1.4, 2.1), "thrust": (1.5, 3.0, 4.5)}
-"""Of steps: rad/s about the body's axes, m/s² of thrust [choice]."""
+"""Amplitudes of steps: rad/s about the body's axes, m/s² of thrust [choice]."""
 HOLD = {"roll": 0.10, "pitch": 0.10, "yaw": 0.30, "thrust": 0.12}
-"""s for which the first of three steps is held, the second twice as long back, the third as the first: the vehicle ends
-where it was, and nearly at rest [choice]."""
+"""s for which the first and third of three steps are held; the second is opposite and twice as long, so that the
+vehicle ends where it was, and nearly at rest [choice]."""
 REST = 1.0
-"""s between two triples, in which it returns to its place [choice]."""
+"""s between two triples, in which the vehicle returns to its place [choice]."""
 SETTLE = 2.0
-"""s before the first [choice]."""
+"""s of hover before the first step and after the last [choice]."""
 RANDOM = 4.0
-"""s of steps whose signs are drawn, which tell more of delays, about each axis [choice]."""
+"""s of steps of random sign per axis, which reveal delays better [choice]."""
 RANDOM_HOLD = 0.05, 0.15
-"""s, of each [choice]."""
+"""s, shortest and longest of these steps [choice]."""
 
 KP, KD, KA, KYAW = 3.0, 3.0, 6.0, 2.0
-"""Of the hover between steps, in 1/s², 1/s, 1/s and 1/s: slow against any rate loop that flies [choice]."""
+"""Gains of the hover, in 1/s², 1/s, 1/s and 1/s: slow compared with any usable rate loop [choice]."""
 SIDEWAYS = 3.0
-"""m/s², the most that it accelerates sideways with [choice]."""
+"""m/s², largest sideways acceleration [choice]."""
 
 
 class Step(NamedTuple):
-    """Something that is added to the hover for a while.
+    """An offset that is added to the hover's setpoint for a while.
 
     Args:
         begin: s, from the beginning of the flight.
@@ -75,7 +75,7 @@ def make_schedule(seed: int = 0) -> list[Step]:
 
 
 def _draw(time: float, seed: int) -> Iterator[tuple[float, float, float]]:
-    """Yield beginnings, ends and signs of random steps from a time on; their sum over time stays near zero."""
+    """Yield start, end and sign of random steps from a time on; their integral over time stays near zero."""
     random, until, turned = np.random.default_rng(seed), time + RANDOM, 0.0
     while time < until:
         held = random.uniform(*RANDOM_HOLD)
@@ -86,16 +86,16 @@ def _draw(time: float, seed: int) -> Iterator[tuple[float, float, float]]:
 
 
 class IdentificationFlyer:
-    """A `Flyer` that hovers where it was begun, and makes the steps of `make_schedule`.
+    """A `Flyer` that hovers above its start, and makes the steps of `make_schedule`.
 
     Args:
-        height: m above that place at which it hovers.
-        seed: Of the random steps.
+        height: Height of the hover above the start, m.
+        seed: Seed of the random steps.
 
     Attributes:
         rate: Hz.
         camera: None: it needs no image.
-        duration: s that all of it takes.
+        duration: Length of the whole flight, s.
     """
 
     rate = RATE
@@ -112,7 +112,7 @@ class IdentificationFlyer:
         self._began: float | None = None
 
     def act(self, pose: Pose, image: np.ndarray | None, target_gate: int) -> Setpoint:
-        """Hover, with what is due of the steps."""
+        """Return the setpoint of the hover, plus the step that is due."""
         turned = rotation_matrix(pose.attitude)
         if self._began is None:
             self._began, self._place = pose.time, pose.position + np.array((0.0, 0.0, self._height))
@@ -135,4 +135,4 @@ class IdentificationFlyer:
         return Setpoint(thrust, rates)
 
     def prepare(self) -> None:
-        """Nothing: where the vehicle will be is not known before."""
+        """Do nothing: the next pose is not known yet."""

@@ -1,4 +1,4 @@
-"""What a flight controller's gyro and accelerometer tell: readings, and the packet in which a plant sends them.
+"""Samples of a flight controller's gyro and accelerometer, and the UDP packet in which a plant sends them.
 
 A sample is (6,): body rates in rad/s, then specific force in m/s², +9.81 upwards at rest; body frame FLU. The packet,
 little endian, 68 bytes: ``b"DRI1"``, sequence number u32, the sender's time f64 (s), six f64, and CRC-32 u32 of all
@@ -26,8 +26,8 @@ LARGEST = 1e4
 """rad/s or m/s² beyond which a number is no measurement of a drone [choice]."""
 
 AT_REST = 0.25
-"""Share of its weight by which the specific force of what stands still may differ from it [choice]: one of another
-scale is off by a half at least."""
+"""Share by which the specific force of a resting vehicle may differ from gravity [choice]; a wrong scale is off by at
+least a half."""
 
 
 class ImuReading(NamedTuple):
@@ -55,7 +55,7 @@ def encode_imu(sequence: int, stamp: float, sample: np.ndarray) -> bytes:
 
 
 def decode_imu(data: bytes) -> np.ndarray | None:
-    """Return the sample of a packet; None if it is none: of another size or kind, damaged, or not plausible."""
+    """Return the sample in a packet; None if it has another size or kind, is damaged, or is not plausible."""
     if (
         len(data) != PACKET_SIZE
         or data[:4] != MAGIC
@@ -67,7 +67,7 @@ def decode_imu(data: bytes) -> np.ndarray | None:
 
 
 def unlike_rest(sample: np.ndarray) -> str | None:
-    """Say what of a sample is not as where a vehicle stands still; None if it is."""
+    """Return why a sample cannot be that of a resting vehicle, in words; None if it can."""
     force = float(np.linalg.norm(sample[3:]))
     if math.isfinite(force) and abs(force - GRAVITY) <= AT_REST * GRAVITY:
         return None

@@ -1,4 +1,4 @@
-"""Where bytes come in, without ever waiting: UDP; a serial port is `links.serial_port.SerialPort`."""
+"""Non-blocking receivers of bytes: UDP here, serial ports in `links.serial_port.SerialPort`."""
 
 from __future__ import annotations
 
@@ -20,16 +20,16 @@ RECEIVED_AT = 35 if sys.platform == "linux" else None  # SO_TIMESTAMPNS, which P
 
 
 class Inlet(Protocol):
-    """Gives the bytes that have arrived.
+    """A non-blocking receiver of bytes.
 
     Attributes:
-        whole: Whether pieces hold whole messages, as datagrams do; else a message may end in a later piece.
+        whole: Whether each chunk holds whole messages, as datagrams do; else a message may span several chunks.
     """
 
     whole: bool
 
     def read(self) -> Iterator[tuple[float, bytes]]:
-        """Yield what has arrived, oldest first, with the time at which it did (s, ``time.monotonic``).
+        """Yield the received chunks, oldest first, each with its arrival time (s, ``time.monotonic``).
 
         Raises:
             OSError: The device is gone.
@@ -37,19 +37,19 @@ class Inlet(Protocol):
         ...
 
     def close(self) -> None:
-        """Give back socket or device; may be called twice."""
+        """Close the socket or device; may be called twice."""
         ...
 
 
 class UdpInlet:
-    """Listens on a UDP port; pieces are datagrams, with the time at which the kernel received them.
+    """Receives datagrams on a UDP port, each with the kernel's receive timestamp.
 
-    Linux begins to do so a few ms after the machine's first socket has asked for it; until then the time is that of
-    reading.
+    Linux starts to timestamp a few ms after the machine's first socket asks for it; until then, the time of reading is
+    used.
 
     Args:
-        port: To listen on; 0 for a free one.
-        host: Address to listen on; other machines reach it only if this says so.
+        port: Port to listen on; 0 picks a free one.
+        host: Address to listen on; the default accepts datagrams from this machine only.
 
     Attributes:
         address: Host and port that it listens on.
@@ -59,7 +59,7 @@ class UdpInlet:
     """
 
     whole = True
-    _MOST = 1024  # datagrams taken in at a time: a flood must not stop the loop
+    _MOST = 1024  # datagrams read per call, so that a flood cannot stall the loop
     _SIZE = 2048  # bytes; more than an Ethernet frame holds
 
     def __init__(self, port: int, host: str = "127.0.0.1") -> None:
@@ -86,10 +86,10 @@ class UdpInlet:
 
 
 def bind(host: str, port: int) -> socket.socket:
-    """Return a UDP socket that listens and never waits.
+    """Return a non-blocking UDP socket bound to an address.
 
     Raises:
-        OSError: It cannot; the message names host and port.
+        OSError: The address cannot be bound; the message names host and port.
     """
     listening = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
     try:
@@ -103,24 +103,24 @@ def bind(host: str, port: int) -> socket.socket:
 
 
 class Arrivals:
-    """Puts the kernel's times of arrival, which are the wall clock's, on the monotonic clock; the first may be set.
+    """Converts the kernel's receive timestamps from the wall clock to the monotonic clock, even if the former is set.
 
-    What arrived did so after the queue was last empty. A time that the wall clock of now puts before that, or into the
-    future, was stamped before the clock was set: there the difference of the clocks as it was then counts.
+    A datagram arrived after the queue was last empty. If the present clock difference puts it before that, or into the
+    future, it was stamped before the wall clock was set, and the clock difference of that time is used.
     """
 
-    _SLACK = 1e-3  # s, to which the two clocks can be compared [choice]: reading both may be interrupted
+    _SLACK = 1e-3  # s, tolerance of comparing the two clocks [choice]: reading both may be interrupted
 
     def __init__(self) -> None:
         self.emptied(time.monotonic())
 
     def emptied(self, since: float) -> None:
-        """Say that nothing was waiting any more at a time, s (``time.monotonic``)."""
+        """Note that the queue was empty at a time, s (``time.monotonic``)."""
         self._since = since
-        self._ahead = time.time() - time.monotonic()  # s, of the wall clock before the monotonic one
+        self._ahead = time.time() - time.monotonic()  # s, wall clock minus monotonic clock
 
     def of(self, ancillary: list[tuple[int, int, bytes]]) -> float:
-        """Return when a datagram that was read just now arrived; now, if the kernel does not say."""
+        """Return the arrival time of a datagram that was just read; now, if the kernel gave no timestamp."""
         now = time.monotonic()
         stamp = kernel_stamp(ancillary)
         if stamp is None:
@@ -132,7 +132,7 @@ class Arrivals:
 
 
 def kernel_stamp(ancillary: list[tuple[int, int, bytes]]) -> float | None:
-    """Return when the kernel received a datagram, s by the wall clock; None if it does not say."""
+    """Return the kernel's receive timestamp of a datagram, s by the wall clock; None if there is none."""
     for level, kind, data in ancillary:
         if level == socket.SOL_SOCKET and kind == RECEIVED_AT and len(data) >= 16:
             seconds, nanoseconds = struct.unpack_from("@ll", data)

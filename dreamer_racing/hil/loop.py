@@ -1,4 +1,4 @@
-"""The loop: at a fixed rate, take in what came, tick the chain, send the command, write it down."""
+"""The flight loop: at a fixed rate, read the inputs, run the chain, send the command, and record the tick."""
 
 from __future__ import annotations
 
@@ -27,45 +27,45 @@ from dreamer_racing.hil.watchdog import Watchdog
 logger = logging.getLogger(__name__)
 
 FAREWELL = 1.0
-"""s for which disarm frames are sent after the last tick, however it came to that."""
+"""s for which disarm frames are sent after the last tick, however the flight ended."""
 
 FAREWELL_RATE = 50.0
 """Hz of those frames [choice]."""
 
 LINES_MOST = 64
-"""Lines of the log that may wait for a terminal or a pipe [choice]; further ones are left out."""
+"""Log lines that may wait for a terminal or a pipe [choice]; further ones are dropped."""
 
 LINES_PATIENCE = 1.0
-"""s for which the end of a flight waits for them [choice]; motors are off by then."""
+"""s for which the end of a flight waits for these lines [choice]; motors are off by then."""
 
 OF_THE_ENABLE = (Reason.NO_ENABLE, Reason.NOT_RELEASED)
-"""What speaks against arming as an operator's enable comes and goes, which is not said again each time."""
+"""Reasons that change as the operator's enable comes and goes; they are not logged again each time."""
 
 ENDING = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGQUIT, signal.SIGTSTP)
 """Signals that end a flight: Ctrl-C, a service's stop, a closed terminal, Ctrl-\\ and Ctrl-Z."""
 
 
 class Clock(Protocol):
-    """Tells the time and waits; tests have one of their own."""
+    """A clock to read and to wait on; tests use their own."""
 
     def now(self) -> float:
-        """Return s, of a clock that never jumps."""
+        """Return the time, s, of a clock that never jumps."""
         ...
 
     def sleep_until(self, deadline: float) -> None:
-        """Wait until then; return at once if it is past."""
+        """Wait until a time; return at once if it is past."""
         ...
 
 
 class MonotonicClock:
-    """The machine's own."""
+    """The machine's monotonic clock."""
 
     def now(self) -> float:
         """Return ``time.monotonic``."""
         return time.monotonic()
 
     def sleep_until(self, deadline: float) -> None:
-        """Sleep until then."""
+        """Sleep until a time."""
         remaining = deadline - time.monotonic()
         if remaining > 0.0:
             time.sleep(remaining)
@@ -73,18 +73,18 @@ class MonotonicClock:
 
 @dataclass
 class LoopStatistics:
-    """What a flight's ticks took, all in s.
+    """Timings of a flight's ticks, all in s.
 
     Attributes:
         jitter: How late each tick began.
-        pose_age: Of the newest pose, when the command was sent.
-        latency: From the arrival of the pose that a command is made from to its being sent.
-        render: Of drawing, in ticks that draw.
-        act: Of the flyer.
-        busy: Of the whole tick, until its command is out.
-        prepare: Of what the next one needs and was done ahead of it.
+        pose_age: Age of the newest pose when the command was sent.
+        latency: Time from a pose's arrival to the sending of the command computed from it.
+        render: Rendering time, in ticks that render.
+        act: The flyer's computing time.
+        busy: Time of a tick until its command is sent.
+        prepare: Time of the work done ahead for the next tick.
         overruns: Deadlines missed by ticks that took longer than their period: a long one misses several.
-        unrecorded: Whether writing or showing the flight failed on the way.
+        unrecorded: Whether recording the flight failed on the way.
     """
 
     jitter: list[float] = field(default_factory=list)
@@ -105,7 +105,7 @@ class LoopStatistics:
 
 
 def percentiles(seconds: list[float]) -> dict[str, float] | None:
-    """Return p50, p99 and maximum in ms; None of nothing."""
+    """Return p50, p99 and maximum in ms; None for an empty list."""
     if not seconds:
         return None
     p50, p99, largest = (1e3 * float(value) for value in np.percentile(seconds, (50, 99, 100)))
@@ -116,17 +116,17 @@ class FlightLoop:
     """Flies one flight.
 
     Args:
-        chain: What happens at each tick.
-        poses: Where poses come from.
-        operator: Who answers for it.
-        link: To the vehicle.
+        chain: Computes the command of each tick.
+        poses: Source of poses.
+        operator: Source of the operator's enable and kill.
+        link: Link to the vehicle.
         rate: Hz.
-        recorder: Writes the flight; None: it is not written.
-        watchers: Called after each tick with its outputs; for people to look at.
-        clock: Tells the time.
+        recorder: Records the flight; None: it is not recorded.
+        watchers: Called after each tick with its outputs, to display them.
+        clock: None: the machine's.
 
     Attributes:
-        statistics: What ticks took.
+        statistics: Timings of ticks.
         flew: Whether the vehicle was armed.
     """
 
@@ -150,20 +150,20 @@ class FlightLoop:
         self._watchdog = Watchdog(link, chain.safety.limits.tick_max, self._clock.now)
         self._lines = Aside(LINES_MOST)
         self._stop: str | None = None
-        self._dropped = False  # whether the command of the tick before was
+        self._dropped = False  # whether the command of the tick before was dropped
         self._broken: set[str] = set()  # what has failed: link, source of poses, operator's switch
         self._said: tuple[object, ...] = ()
 
     def stop(self, reason: str) -> None:
-        """End the flight after the tick that is under way."""
+        """End the flight after the present tick."""
         self._stop = self._stop or reason
 
     def run(self, duration: float | None = None, patience: float | None = None) -> str:
         """Fly until the flight is over; disarm in any case.
 
         Args:
-            duration: s after arming at which it is over; None: as long as it takes.
-            patience: s for which it waits to be armed; None: as long as it takes.
+            duration: s after arming until the flight ends; None: no limit.
+            patience: s to wait for arming; None: no limit.
 
         Returns:
             Why it ended.
@@ -204,9 +204,9 @@ class FlightLoop:
         return self._stop + ("" if flew else f"; not armed: {words}")
 
     def _say_why_not(self, outputs: Outputs, flew: bool) -> str:
-        """Log what speaks against arming, or ended the flight, when it changes; return it. In flight nothing is said.
+        """Log why the vehicle is not armed, or why the flight ended, when it changes; return it. In flight log nothing.
 
-        An enable that comes and goes is no change as long as something else speaks against arming, too.
+        An enable that comes and goes is no change as long as another reason prevents arming.
         """
         verdict = outputs.verdict
         rejected = self._poses.rejected if Reason.POSE_LOST in verdict.reasons else 0
@@ -219,11 +219,11 @@ class FlightLoop:
         return words
 
     def _log(self, level: int, message: str, *values: object, error: Exception | None = None) -> None:
-        """Log a line, and wait for nobody who is to read it."""
+        """Log a line without waiting for the terminal."""
         self._lines.do(lambda: logger.log(level, message, *values, exc_info=error))
 
     def _tick(self, start: float, deadline: float, overrun: int, armed: bool) -> Outputs:
-        """Do one tick: what came in → chain → link → file."""
+        """Run one tick: inputs → chain → link → recording."""
         operator = self._ask_operator(armed)
         heard = self._listen()
         felt = self._link.feel() if self._chain.feels else []
@@ -244,7 +244,7 @@ class FlightLoop:
         return outputs
 
     def _ask_operator(self, armed: bool) -> Operator:
-        """Return what the operator wants; of a switch that fails, that nothing may fly: safety cuts then."""
+        """Return what the operator wants; no enable if the switch fails, so that safety cuts."""
         try:
             return self._operator.poll(armed)
         except OSError as error:
@@ -252,7 +252,7 @@ class FlightLoop:
             return Operator(enable=False, kill=False)
 
     def _take_poses(self) -> list[Received]:
-        """Return the poses that have come; none of a source that fails: safety holds, then cuts."""
+        """Return the new poses; none if the source fails, so that safety holds, then cuts."""
         try:
             return self._poses.poll()
         except OSError as error:
@@ -260,7 +260,7 @@ class FlightLoop:
             return []
 
     def _listen(self) -> list[Reading] | None:
-        """Return what the link has heard; None of one that fails: what it takes then counts as dropped, too."""
+        """Return the link's voltage readings; None if it fails: the tick's command then counts as dropped, too."""
         try:
             return self._link.listen()
         except OSError as error:
@@ -268,7 +268,7 @@ class FlightLoop:
             return None
 
     def _send(self, command: Command) -> bytes:
-        """Send a command; one that fails, as where an adapter was unplugged, counts as dropped: safety cuts then."""
+        """Send a command; if that fails, as with an unplugged adapter, it counts as dropped, so that safety cuts."""
         try:
             return self._watchdog.send(command)
         except OSError as error:
@@ -276,13 +276,13 @@ class FlightLoop:
             return b""
 
     def _note_broken(self, part: str, error: OSError) -> None:
-        """Say once what a part has met."""
+        """Log a part's first error."""
         if part not in self._broken:
             self._log(logging.ERROR, "%s fails: %s", part, error)
         self._broken.add(part)
 
     def _show(self, inputs: Inputs, outputs: Outputs, took: dict[str, float], sent: bytes) -> None:
-        """Write it down and show it; a full disk, or a page that fails, must not end a flight."""
+        """Record and show a tick; a full disk, or a page that fails, must not end a flight."""
         try:
             if self._recorder is not None:
                 message = {"in": describe_inputs(inputs), "out": describe_outputs(outputs), "took": took, "bytes": sent}
@@ -299,11 +299,11 @@ class FlightLoop:
             self._watchers = ()
 
     def _next(self, deadline: float) -> tuple[float, int]:
-        """Return the next deadline, on the same grid however late it is, and how many were missed."""
+        """Return the next deadline, on the same grid however late the loop is, and how many were missed."""
         now, following = self._clock.now(), deadline + self._period
         if now < following:
             return following, 0
-        left_out = int((now - following) // self._period)  # the one after them is late
+        left_out = int((now - following) // self._period)  # skipped deadlines; the next one is late
         self.statistics.overruns += left_out + 1
         return following + self._period * left_out, left_out + 1
 
@@ -325,7 +325,7 @@ class FlightLoop:
         for _ in range(round(FAREWELL * FAREWELL_RATE)):
             try:
                 self._watchdog.send(at_rest())
-            except Exception as error:  # whatever it is, the next one may get through
+            except Exception as error:  # whatever failed, the next frame may get through
                 if not failed:
                     self._log(logging.ERROR, "the link does not take the disarm frame: %s", error)
                 failed = True
@@ -334,7 +334,7 @@ class FlightLoop:
 
     @contextmanager
     def _answering_signals(self) -> Iterator[None]:
-        """Let the signals of `ENDING` end the flight, and a second one not interrupt the farewell."""
+        """Let the signals of `ENDING` end the flight; a second one does not interrupt the final disarm frames."""
 
         def stop(number: int, frame: FrameType | None) -> None:
             self.stop(f"{signal.Signals(number).name}")
@@ -349,7 +349,7 @@ class FlightLoop:
 
 @contextmanager
 def _without_garbage_collection() -> Iterator[None]:
-    """Keep the collector from stopping the loop: what a flight allocates is freed by reference counts."""
+    """Disable the garbage collector, which would stall the loop; reference counting frees a flight's objects."""
     gc.collect()
     gc.freeze()
     gc.disable()

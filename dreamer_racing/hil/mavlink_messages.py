@@ -1,4 +1,4 @@
-"""MAVLink's messages, for the link and for the source of poses."""
+"""Import of MAVLink's message definitions, for the link and for the pose source."""
 
 from __future__ import annotations
 
@@ -11,10 +11,10 @@ def import_messages(who: str) -> Any:
     """Return the module of MAVLink 2's common messages.
 
     Args:
-        who: Needs it, for the message.
+        who: What needs it, for the error message.
 
     Raises:
-        ImportError: It is not installed.
+        ImportError: pymavlink is not installed.
     """
     try:
         from pymavlink.dialects.v20 import common

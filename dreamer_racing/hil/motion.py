@@ -1,4 +1,4 @@
-"""What poses tell `safety.Safety`: plain numbers, and whether a vehicle could have gone from one pose to the next."""
+"""Plausibility checks of poses for `safety.Safety`: could a vehicle have moved from one pose to the next?"""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from dreamer_racing.hil.vehicle import Pose
 
 
 class Seen(NamedTuple):
-    """A pose in plain numbers: as `Pose`, with an attitude of unit length."""
+    """A `Pose` in plain Python numbers, with an attitude of unit length."""
 
     time: float
     position: Vector
@@ -33,18 +33,18 @@ class Seen(NamedTuple):
 
     @property
     def yaw_degrees(self) -> float:
-        """Direction of body x from world x, left."""
+        """Heading of body x from world x, positive to the left."""
         w, x, y, z = self.attitude
         return math.degrees(math.atan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z)))
 
     def degrees_from(self, other: Seen) -> float:
-        """Angle by which one attitude is turned from another, about whatever axis, the short way round."""
+        """Return the angle between this attitude and another, about any axis, the short way round."""
         cosine = sum(here * there for here, there in zip(self.attitude, other.attitude, strict=True))
         return math.degrees(2.0 * math.acos(min(1.0, abs(cosine))))
 
 
 def read_pose(pose: Pose) -> Seen | None:
-    """Return a pose in plain numbers; None if one is not finite, or the attitude is none."""
+    """Return a pose in plain numbers; None if one is not finite, or the attitude is far from unit length."""
     time = to_number(pose.time)
     position, velocity, rates = (
         to_numbers(value, 3) for value in (pose.position, pose.linear_velocity, pose.body_rates)
@@ -65,9 +65,9 @@ class Motion:
         limits: How far and how fast a vehicle may go and turn.
 
     Attributes:
-        newest: None before the first pose.
-        repeats: Whether the newest one stands exactly where the one before it did; a measurement never does.
-        changed_at: s, since when poses stand where the newest one does.
+        newest: Newest pose; None before the first.
+        repeats: Whether the newest pose exactly repeats the one before; real measurements never do.
+        changed_at: s, since when poses have not changed.
     """
 
     def __init__(self, limits: SafetyLimits) -> None:
@@ -79,7 +79,7 @@ class Motion:
         self._turns = TurnOdometer(limits.velocity_window, gap=limits.hold_after)
 
     def take(self, seen: Seen) -> Findings:
-        """Take in a pose that is newer than the last; find what no vehicle does from one to the other."""
+        """Add a pose that is newer than the last; return findings of motion that is impossible for a vehicle."""
         last, self.newest = self.newest, seen
         self.repeats = last is not None and (seen.position, seen.attitude) == (last.position, last.attitude)
         if not self.repeats:
@@ -88,7 +88,7 @@ class Motion:
         return findings | self._check_claims(seen)
 
     def _check_claims(self, seen: Seen) -> Findings:
-        """Compare velocities and body rates, by which images are drawn, with where the poses themselves went."""
+        """Compare reported velocities and body rates, by which poses are extrapolated, with how the poses changed."""
         limits = self._limits
         moved = self._odometer.mismatch(seen.time, seen.position, seen.velocity)
         turned = self._turns.mismatch(seen.time, seen.attitude, seen.body_rates)
@@ -99,7 +99,7 @@ class Motion:
         return {Reason.POSE_CONTRADICTION: ", and ".join(words)} if words else {}
 
     def _check_step(self, last: Seen, seen: Seen) -> Findings:
-        """Compare how far it went, and by how much it turned, with what is possible in the time between two poses."""
+        """Compare distance and angle between two poses with what is possible in the time between them."""
         limits, elapsed = self._limits, seen.time - last.time
         findings: Findings = {}
         moved, turned = math.dist(seen.position, last.position), seen.degrees_from(last)

@@ -1,4 +1,4 @@
-"""Whether velocities and body rates that a source of poses claims are those of its own positions and attitudes."""
+"""Checks whether the velocities and body rates of a pose source agree with its own positions and attitudes."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from dreamer_racing.hil.velocity import GAP
 
 
 class _Mark(NamedTuple):
-    """A pose's position or attitude, the rate that is claimed there, and where the rates so far have led."""
+    """A pose's position or attitude, its reported velocity or body rates, and the integral of those so far."""
 
     time: float
     place: Vector
@@ -21,11 +21,11 @@ class _Mark(NamedTuple):
 
 
 class Odometer:
-    """Compares, over a window of time, where claimed velocities lead, by trapezoids, with where positions went.
+    """Compares reported velocities, integrated by trapezoids over a time window, with the change of position.
 
     Args:
-        window: s, that is looked back, at least; up to a pose more.
-        gap: s between two poses beyond which nothing is known of what was between, and it begins anew.
+        window: Least length of the window, s; it is up to one pose interval longer.
+        gap: s between two poses beyond which the comparison starts anew.
 
     Example:
         >>> odometer = Odometer(window=0.0625)
@@ -42,15 +42,15 @@ class Odometer:
         self._marks: deque[_Mark] = deque()
 
     def mismatch(self, time: float, place: Vector, rate: Vector) -> float | None:
-        """Take in a pose that is newer than the last; return by how much the mean rates differ, m/s.
+        """Add a pose newer than the last; return the difference of the mean velocities over the window, m/s.
 
         Args:
             time: s.
             place: Position, m.
-            rate: Velocity there, m/s.
+            rate: Reported velocity, m/s.
 
         Returns:
-            None as long as poses do not span the window, be it since the first one or since a gap.
+            None until the poses since the first one, or since a gap, span the window.
         """
         marks = self._marks
         last = marks[-1] if marks else None
@@ -70,25 +70,25 @@ class Odometer:
 
     @staticmethod
     def _lead(led: Vector, step: Vector) -> Vector:
-        """Return where a step leads from there."""
+        """Return the integral after one more step."""
         return tuple(here + more for here, more in zip(led, step, strict=True))
 
     @staticmethod
     def _change(first: Vector, last: Vector) -> Vector:
-        """Return what leads from one place to another."""
+        """Return the displacement from one place to another."""
         return tuple(there - here for here, there in zip(first, last, strict=True))
 
     @staticmethod
     def _apart(went: Vector, meant: Vector) -> float:
-        """Return how far two changes are apart."""
+        """Return the distance between two displacements."""
         return math.dist(went, meant)
 
 
 class TurnOdometer(Odometer):
-    """The same of body rates, rad/s in the body frame, and attitudes, wxyz of unit length.
+    """An `Odometer` for body rates, rad/s in the body frame, and attitudes, wxyz of unit length.
 
-    Rates about changing axes do not add up, so rotations are composed, and the angle between the two that come of it is
-    what they differ by.
+    Rates about changing axes do not add up, so rotations are composed; the mismatch is the angle between the two
+    resulting rotations, per time.
 
     Example:
         >>> odometer = TurnOdometer(window=0.0625)

@@ -1,6 +1,6 @@
-"""The person who answers for the flight: who lets the vehicle fly, and may stop it at any time.
+"""The operator of a flight: the person who enables the vehicle, and may stop it at any time.
 
-A switch for a flight with ``operator=udp``, in a terminal of the machine that the person sits at:
+For a flight with ``operator=udp``, start a switch in a terminal of the operator's machine:
 
     python -m dreamer_racing.hil.operator --host 192.168.1.20       # e: the enable; any other key, or Ctrl-C: kill
 """
@@ -33,7 +33,7 @@ DEAD_MAN = 0.5
 SEND_RATE = 20.0
 """Hz at which the switch of this file sends [choice]."""
 KILLS = 20
-"""Packets of a kill that it sends before it ends [choice]: radios lose some."""
+"""Kill packets that the switch sends before it ends [choice]: radios lose some."""
 
 logger = logging.getLogger(__name__)
 
@@ -51,14 +51,14 @@ class Operator(NamedTuple):
 
 
 class OperatorSource(Protocol):
-    """Where the operator's will comes from."""
+    """A source of the operator's enable and kill."""
 
     def poll(self, armed: bool = False) -> Operator:
-        """Return what is wanted now, without waiting; ``armed``: whether the vehicle is, since the tick before."""
+        """Return the operator's wish, without blocking; ``armed``: whether the vehicle is, since the tick before."""
         ...
 
     def close(self) -> None:
-        """Give back socket or terminal; may be called twice."""
+        """Release the socket or terminal; may be called twice."""
         ...
 
 
@@ -69,7 +69,7 @@ def encode_operator(sequence: int, operator: Operator) -> bytes:
 
 
 def decode_operator(data: bytes) -> tuple[int, Operator] | None:
-    """Return sequence number and will; None if it is no such packet, or a damaged one."""
+    """Return a packet's sequence number and content; None if it is not such a packet, or damaged."""
     if len(data) != PACKET_SIZE or data[:4] != MAGIC:
         return None
     _, sequence, enable, kill = _BODY.unpack_from(data)
@@ -79,19 +79,19 @@ def decode_operator(data: bytes) -> tuple[int, Operator] | None:
 
 
 class UdpOperator:
-    """A switch on the network. A kill is remembered; an enable lapses when packets stop.
+    """A switch on the network. A kill is latched; an enable lapses when packets stop.
 
     Args:
         port: To listen on.
         host: Address to listen on.
-        clock: s; for tests.
+        clock: Returns the time, s; tests replace it.
 
     Attributes:
-        rejected: Datagrams that were no such packets, or older than one before; a switch that begins to count anew must
-            be waited for with a new flight.
+        rejected: Number of datagrams that were invalid, or older than one before. A switch that restarts its numbers
+            needs a new flight.
     """
 
-    _MOST = 256  # datagrams taken in at a time: a flood must not stop the loop
+    _MOST = 256  # datagrams read per call, so that a flood cannot stall the loop
 
     def __init__(self, port: int, host: str = "127.0.0.1", clock: Callable[[], float] = time.monotonic) -> None:
         self.rejected = 0
@@ -103,7 +103,7 @@ class UdpOperator:
         self._sequence: int | None = None
 
     def poll(self, armed: bool = False) -> Operator:
-        """Return what is wanted now, without waiting."""
+        """Return the operator's wish, without blocking."""
         for _ in range(self._MOST):
             try:
                 data = self._socket.recv(PACKET_SIZE + 1)
@@ -118,7 +118,7 @@ class UdpOperator:
             self.rejected += 1
             return
         sequence, will = packet
-        # A kill is obeyed whatever its number; an enable that is not newer may be a replayed one.
+        # A kill counts whatever its number; an enable that is not newer may be replayed.
         replayed = self._sequence is not None and (sequence - self._sequence - 1) % 2**32 >= 2**31
         if replayed:
             self.rejected += 1
@@ -132,7 +132,7 @@ class UdpOperator:
 
 
 class KeyboardOperator:
-    """The terminal: ``e`` gives or takes back the enable; any other key kills.
+    """Reads keys from the terminal: ``e`` toggles the enable; any other key kills.
 
     Raises:
         OSError: There is no terminal.
@@ -152,10 +152,10 @@ class KeyboardOperator:
         self._will = Operator(False, False)
 
     def poll(self, armed: bool = False) -> Operator:
-        """Return what is wanted now, without waiting."""
+        """Return the operator's wish, without blocking."""
         if self._select([self._terminal], [], [], 0.0)[0]:
             try:
-                keys = os.read(self._terminal.fileno(), 1024)  # past Python's buffer, in which select sees nothing
+                keys = os.read(self._terminal.fileno(), 1024)  # bypasses Python's buffer, which select does not see
             except OSError:
                 keys = b""  # the terminal is gone
             enable = self._will.enable ^ bool(keys.count(b"e") % 2)
@@ -163,24 +163,24 @@ class KeyboardOperator:
         return self._will
 
     def close(self) -> None:
-        """Give the terminal back as it was."""
+        """Restore the terminal's settings."""
         if self._before is not None:
             self._termios.tcsetattr(self._terminal, self._termios.TCSADRAIN, self._before)
             self._before = None
 
 
 def is_remote_terminal() -> bool:
-    """Whether the terminal seems to be at the other end of a network; ``sudo`` and ``tmux`` may hide it."""
+    """Return whether the terminal seems to be at the other end of a network; ``sudo`` and ``tmux`` may hide it."""
     return bool(os.environ.get("SSH_CONNECTION"))
 
 
 def send_will(source: OperatorSource, send: Callable[[bytes], object], sleep: Callable[[float], None]) -> None:
-    """Send what an operator wants until that is a kill, and the kill for a while; Ctrl-C is one, too.
+    """Send an operator's wish until it is a kill, then the kill for a while; Ctrl-C is a kill, too.
 
     Args:
-        source: Who is asked.
-        send: Takes the packets, which are numbered by the clock: a switch that is begun anew goes on counting.
-        sleep: Waits for so many s.
+        source: Source of the wish.
+        send: Sends a packet. Packets are numbered by the clock, so that a restarted switch continues the sequence.
+        sleep: Waits for a number of s.
     """
     number, left, will, said = int(SEND_RATE * time.time()), KILLS, Operator(False, False), ""
     while left:
@@ -221,11 +221,11 @@ def main() -> None:
 
 
 class TimedOperator:
-    """Enables by itself, again and again until the vehicle is armed: for one that is simulated, never for a real one.
+    """Toggles the enable automatically until the vehicle is armed: for simulated vehicles, never for real ones.
 
     Args:
-        delay: s for which it releases, and then enables, in turn.
-        clock: s; for tests.
+        delay: s for which the enable is released, and then given, alternately.
+        clock: Returns the time, s; tests replace it.
     """
 
     def __init__(self, delay: float = 0.5, clock: Callable[[], float] = time.monotonic) -> None:
@@ -234,7 +234,7 @@ class TimedOperator:
         self._armed = False
 
     def poll(self, armed: bool = False) -> Operator:
-        """Return what is wanted now: once the vehicle is armed the enable stays."""
+        """Return the present enable, which stays once the vehicle is armed."""
         now = self._clock()
         if self._from is None:
             self._from = now

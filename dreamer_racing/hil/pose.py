@@ -1,4 +1,4 @@
-"""Poses over UDP: the packet, and the socket that takes them in without ever waiting.
+"""Poses over UDP: the packet, and a non-blocking receiver.
 
 The packet, little endian, 124 bytes: ``b"DRP1"``, sequence number u32, the sender's time f64 (s, of any clock that does
 not jump), position 3 f64, attitude 4 f64 (wxyz), linear velocity 3 f64, body rates 3 f64, and CRC-32 u32 of all before
@@ -26,7 +26,7 @@ LARGEST = 1e6
 
 
 class PosePacket(NamedTuple):
-    """What a pose packet says.
+    """The content of a pose packet.
 
     Args:
         sequence: Counts packets, modulo 2³².
@@ -50,7 +50,7 @@ class Received(NamedTuple):
 
     Args:
         time: s, ``time.monotonic``.
-        packet: What it says.
+        packet: Its content.
     """
 
     time: float
@@ -58,21 +58,21 @@ class Received(NamedTuple):
 
 
 class PoseSource(Protocol):
-    """Where poses come from.
+    """A source of pose packets.
 
     Attributes:
-        rejected: Messages so far that were no pose: malformed, damaged, with numbers that are not `plausible`, or of an
-            attitude that is none.
+        rejected: Number of messages so far that gave no pose: malformed, damaged, not `plausible`, or with an attitude
+            that is not of unit length.
     """
 
     rejected: int
 
     def poll(self) -> list[Received]:
-        """Return what has arrived since the last call, oldest first, without waiting."""
+        """Return the packets that arrived since the last call, oldest first, without blocking."""
         ...
 
     def close(self) -> None:
-        """Give back socket or device; may be called twice."""
+        """Close the socket or device; may be called twice."""
         ...
 
 
@@ -84,7 +84,7 @@ def encode_pose(packet: PosePacket) -> bytes:
 
 
 def decode_pose(data: bytes) -> PosePacket | None:
-    """Return what a packet says; None if it is none: of another size or kind, damaged, or with impossible numbers."""
+    """Return a packet's content; None if it has another size or kind, is damaged, or has impossible numbers."""
     if (
         len(data) != PACKET_SIZE
         or data[:4] != MAGIC
@@ -104,7 +104,7 @@ def make_packet(
     linear_velocity: np.ndarray,
     body_rates: np.ndarray,
 ) -> PosePacket | None:
-    """Return a packet with its attitude at unit length; None if a number is not plausible or the attitude is none."""
+    """Return a packet with its attitude normalised; None if a number is implausible or the attitude far from unit."""
     if not (np.isfinite(stamp) and plausible(position, attitude, linear_velocity, body_rates)):
         return None
     length = float(np.linalg.norm(attitude))
@@ -114,16 +114,16 @@ def make_packet(
 
 
 def plausible(*vectors: np.ndarray) -> bool:
-    """Whether all numbers are finite, and of a size that can be calculated with."""
+    """Return whether all numbers are finite, and of size `LARGEST` at most."""
     return all(bool((np.abs(vector) <= LARGEST).all()) for vector in vectors)
 
 
 class UdpPose:
-    """Takes poses from a UDP socket, each with the time at which the kernel received it.
+    """Receives poses on a UDP socket, each with the kernel's receive timestamp.
 
     Args:
-        port: To listen on; 0 for a free one.
-        host: Address to listen on; other machines reach it only if this says so.
+        port: Port to listen on; 0 picks a free one.
+        host: Address to listen on; the default accepts poses from this machine only.
 
     Attributes:
         address: Host and port that it listens on.
@@ -139,7 +139,7 @@ class UdpPose:
         self.address = self._inlet.address
 
     def poll(self) -> list[Received]:
-        """Return what has arrived since the last call, oldest first, without waiting."""
+        """Return the packets that arrived since the last call, oldest first, without blocking."""
         received = []
         for time, data in self._inlet.read():
             packet = decode_pose(data)

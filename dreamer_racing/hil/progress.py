@@ -1,4 +1,4 @@
-"""Which gate comes next, from positions alone."""
+"""Tracks which gate comes next, from positions alone."""
 
 from __future__ import annotations
 
@@ -27,15 +27,15 @@ class GatePass(NamedTuple):
 
 
 class GateProgress:
-    """Counts gates passed in order. A pass goes forwards through the plane, inside of the opening less its margin.
+    """Counts gates passed in order. A pass crosses the gate's plane forwards, inside its opening less a margin.
 
     Args:
         track: The gates.
-        limits: Of safety: no gate is passed by a pose that is further from the one before than they allow.
+        limits: Safety limits; a pose that has jumped further than they allow passes no gate.
 
     Attributes:
         target: Index of the gate that comes next.
-        passes: Those passed since `reset`, in order.
+        passes: Gates passed since `reset`, in order.
     """
 
     def __init__(self, track: Track, limits: SafetyLimits) -> None:
@@ -53,12 +53,12 @@ class GateProgress:
         self._last: Pose | None = None
 
     def update(self, pose: Pose, judged: bool = True) -> GatePass | None:
-        """Take in the next measured pose; return the gate passed since the one before, if there is one.
+        """Add the next measured pose; return the gate passed since the one before, if any.
 
         Args:
             pose: The pose.
-            judged: Whether safety judges it, as it does the newest of each tick; another that is too far away is left
-                out, and progress goes on from the one before.
+            judged: Whether safety checks this pose, as it does the newest of each tick. An unchecked pose that has
+                jumped is ignored, and progress continues from the one before.
         """
         last = self._last
         if last is None:

@@ -1,4 +1,4 @@
-"""Why a vehicle is in its state, or does not arm: what `safety.Safety` and those whom it asks find."""
+"""Reasons why a vehicle is in its state, or does not arm, as found by `safety.Safety` and its checks."""
 
 from __future__ import annotations
 
@@ -39,4 +39,4 @@ class Reason(enum.Enum):
 
 
 Findings = dict[Reason, str]
-"""Each with its words for a person."""
+"""Reasons found at a tick, each with a message for a person."""

@@ -1,9 +1,8 @@
-"""Every flight is a file: what came in at each tick and what went out, in the order in which it happened.
+"""Records each flight to a file: the inputs and outputs of every tick, in order.
 
-The file is MCAP, which robotics tools read (https://mcap.dev): messages in JSON on ``/flight`` (once: everything that
-the flight was begun with) and ``/tick``. Each message is written at once, so that a flight whose loop is killed is
-there up to its last ticks; by a thread, so that a disk that stalls holds up no flight. Floats are written so that
-reading gives the same bits.
+The file is MCAP, which robotics tools read (https://mcap.dev), with JSON messages on ``/flight`` (once: the settings of
+the flight) and ``/tick``. A thread writes each message at once, so that the recording of a killed loop ends only a few
+ticks early, and a disk that stalls does not delay the loop. Floats are written so that reading gives the same bits.
 """
 
 from __future__ import annotations
@@ -26,25 +25,25 @@ from dreamer_racing.hil.aside import Aside
 FLIGHT, TICK = "/flight", "/tick"
 FILE = "flight.mcap"
 TRACK = "track_as_flown"
-"""Of what a flight is begun with: the content of its track's file, as `describe_track` writes it."""
+"""Key in the ``/flight`` message of the content of the track's file, as `describe_track` writes it."""
 FORMAT_VERSION = 1
 
 WAITING_MOST = 256
 """Ticks that may wait for the disk [choice]: 5 s at 50 Hz, of some kilobytes each."""
 
 CLOSING = 10.0
-"""s for which the end of a recording waits for the disk [choice]."""
+"""s for which `FlightRecorder.close` waits for the disk [choice]."""
 
 
 class FlightRecorder:
     """Writes the file of a flight.
 
     Args:
-        path: The file; there must be none yet.
-        about: JSON values with which the flight is begun, the track under `TRACK`.
+        path: The file; it must not exist yet.
+        about: JSON values that describe the flight, with its track under `TRACK`.
 
     Raises:
-        FileExistsError: There is one: a flight is never overwritten.
+        FileExistsError: The file exists: a flight is never overwritten.
         ImportError: mcap is not installed.
     """
 
@@ -64,12 +63,12 @@ class FlightRecorder:
         self._write(FLIGHT, 0.0, _encode({"format_version": FORMAT_VERSION, **about}))
 
     def tick(self, time: float, message: dict[str, Any]) -> None:
-        """Have written what happened in a tick at a time, s by the loop's clock; wait for no disk.
+        """Queue a tick's message without waiting for the disk; its time is in s, by the loop's clock.
 
         Raises:
-            OSError: A tick before could not be written, or the disk has taken none for long; the file ends there.
+            OSError: An earlier tick could not be written, or the disk has stalled for long; the file ends there.
         """
-        data = _encode(message)  # now: what it speaks of may change
+        data = _encode(message)  # now, because its objects may change
         if not self._aside.do(partial(self._write, TICK, time, data)):
             self._fail()
 
@@ -87,7 +86,7 @@ class FlightRecorder:
         """Finish the file; may be called twice.
 
         Raises:
-            OSError: Something could not be written, and `tick` has not said so.
+            OSError: Something could not be written, and `tick` has not raised that.
         """
         if self._file.closed:
             return
@@ -95,14 +94,14 @@ class FlightRecorder:
         if written and not said:
             self._writer.finish()
             self._file.close()
-        elif written or self._aside.error is not None:  # else the disk would not take the end either
-            with suppress(OSError):  # which has been said, or is below
+        elif written or self._aside.error is not None:  # else the disk hangs, and closing would, too
+            with suppress(OSError):  # raised before, or below
                 self._file.close()
         if not written and not said:
             self._fail()
 
     def __enter__(self) -> Self:
-        """Go on recording."""
+        """Return the recorder."""
         return self
 
     def __exit__(
@@ -113,20 +112,20 @@ class FlightRecorder:
 
 
 class Flight:
-    """A flight that was recorded.
+    """A recorded flight.
 
     Args:
-        path: The file, or the folder in which it is.
+        path: The file, or its folder.
 
     Attributes:
-        about: With what it was begun.
-        ticks: What happened, a dictionary each.
-        holds_track: Whether the track is in the file; it is since flights keep it.
+        about: The values that describe it.
+        ticks: The messages of its ticks.
+        holds_track: Whether the file contains the track; older recordings do not.
         whole: Whether the file was finished; if not, the loop was killed.
 
     Raises:
-        FileNotFoundError: There is none.
-        ValueError: It is no such file, or of another version.
+        FileNotFoundError: There is no such file.
+        ValueError: The file is not a recorded flight, or of another version.
     """
 
     def __init__(self, path: Path) -> None:
@@ -144,11 +143,11 @@ class Flight:
         self._path = path
 
     def track(self) -> Track:
-        """Return the track that was flown; of a flight that does not hold it, the track of its name as it is now.
+        """Return the track that was flown; if the file lacks it, the present track of its name.
 
         Raises:
-            TrackError: The file's is damaged, or there is no such track any more.
-            KeyError: The file names none.
+            TrackError: The recorded track is damaged, or there is no such track any more.
+            KeyError: The file names no track.
         """
         if self.holds_track:
             return read_track(self.about[TRACK], f"{self._path}: {TRACK}")
@@ -182,7 +181,7 @@ def _encode(message: dict[str, Any]) -> bytes:
 
 
 def _plain(value: Any) -> Any:
-    """Return what json does not know as what it does."""
+    """Convert a value that json cannot encode to one that it can."""
     if isinstance(value, np.ndarray):
         return value.tolist()
     if isinstance(value, np.generic):

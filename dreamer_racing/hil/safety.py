@@ -1,14 +1,14 @@
-"""The last word before a vehicle: whether its motors may turn, and what it is told.
+"""The last check before a vehicle: whether its motors may turn, and which command is sent.
 
 | `State` | what is sent | ends with |
 |---|---|---|
-| DISARMED | at rest | the operator's enable, given anew, and nothing that speaks against it → FLYING |
-| FLYING | what the actor wants, or the lift, within limits | pose or setpoint not fresh → HOLD; else → CUT |
+| DISARMED | at rest | a new enable of the operator, and no finding against arming → FLYING |
+| FLYING | the actor's setpoint, or the lift, within limits | pose or setpoint stale → HOLD; other findings → CUT |
 | HOLD | level hover thrust, zero body rates | both fresh again → FLYING; lost, or any other finding → CUT |
-| CUT | at rest | as DISARMED: it is latched until a new flight is begun on purpose |
+| CUT | at rest | as DISARMED: it is latched until the operator starts a new flight |
 
-`Tick.finish` disarms from FLYING and HOLD; the operator's kill leads to CUT from everywhere.
-There is no clock and no I/O in here: the same ticks give the same verdicts, so a recorded flight can be judged again.
+`Tick.finish` disarms from FLYING and HOLD; the operator's kill leads to CUT from every state.
+There is no clock and no I/O in here: the same ticks give the same verdicts, so a recorded flight can be replayed.
 """
 
 from __future__ import annotations
@@ -39,29 +39,29 @@ class State(enum.Enum):
 _HOLDING = {Reason.POSE_STALE, Reason.NO_SETPOINT}
 _OVER = "the flight is over"
 TIPPING = 2.0
-"""Times the tilt within which it may arm, above which what is lifted counts as tipping over [choice]."""
-# Rates of zero, not such as would level it: a hold lasts 0.1 s, in which levelling would save some decimetres a second,
-# and the attitude to level from is the very thing that is no longer known: after 0.05 s at 10 rad/s it is off by 30°.
+"""Multiple of `SafetyLimits.start_tilt_degrees` above which a lifted vehicle counts as tipping over [choice]."""
+# A hold sends zero rates and does not level: in its 0.1 s levelling would save some decimetres a second, and it would
+# need the attitude, which is no longer known: after 0.05 s at 10 rad/s it is off by 30°.
 _IDLE: Vector = (0.0, 0.0, 0.0, 0.0)
 _HOVER: Vector = (hover().collective_thrust, 0.0, 0.0, 0.0)
 
 
 class Tick(NamedTuple):
-    """What is known at a tick of the loop.
+    """Safety's inputs at a tick of the loop.
 
     Args:
         now: s, ``time.monotonic``.
-        pose: The newest that was measured; None if there is none.
-        pose_age: s since it was measured. The time since `Pose.time` counts where it is longer.
-        setpoint: What the actor wants; None if it wants nothing.
+        pose: The newest measured pose; None if there is none.
+        pose_age: s since it was measured. The time since `Pose.time` counts if it is longer.
+        setpoint: The actor's setpoint; None if it gave none.
         operator: What the operator wants; None counts as no enable.
-        arm_requested: Whether the program was started with leave to arm.
+        arm_requested: Whether the program was started with ``arm=true``.
         contract_mismatch: What of the actor's contract does not fit the vehicle; None if it fits.
-        loop_overrun: Deadlines that the tick before missed, as it took longer than its period.
+        loop_overrun: Deadlines missed because the tick before took longer than its period.
         finish: Whether the flight is over.
-        command_dropped: Whether the command of the tick before did not go out.
-        refusal: Why the flight controller does not fly what it is told, or would not; empty as far as is known.
-        lift: What is sent in place of what the actor wants, if that is usable, until the vehicle is seen to rise.
+        command_dropped: Whether the command of the tick before was not sent.
+        refusal: Why the flight controller does not follow commands, or would not if armed; empty if no reason is known.
+        lift: Setpoint sent instead of the actor's, if that is usable, until the vehicle is seen to rise.
     """
 
     now: float
@@ -79,13 +79,13 @@ class Tick(NamedTuple):
 
 
 class Verdict(NamedTuple):
-    """What becomes of a tick.
+    """The result of a tick.
 
     Args:
         state: From this tick on.
         command: To be sent now.
-        reasons: Of the state: what cut, what it holds for, or what speaks against arming.
-        words: The same for a person, one for each reason.
+        reasons: Why it cut, why it holds, or why it does not arm.
+        words: A message for a person for each reason.
     """
 
     state: State
@@ -100,17 +100,17 @@ class Verdict(NamedTuple):
 
 
 class Safety:
-    """Decides at each tick of the loop whether motors may turn and what is sent; it never raises once it is made.
+    """Decides at each tick of the loop whether motors may turn and what is sent; it never raises after construction.
 
     Args:
         limits: Its thresholds.
 
     Attributes:
         limits: As given.
-        state: Now.
+        state: The present state.
 
     Raises:
-        ValueError: The limits are none; see `SafetyLimits.check`.
+        ValueError: The limits are invalid; see `SafetyLimits.check`.
 
     Example:
         >>> limits = SafetyLimits(fence_low=(-9, -8, -1), fence_high=(9, 8, 5), start_position=(0, 0, 0))
@@ -135,20 +135,20 @@ class Safety:
         return self.state in (State.FLYING, State.HOLD)
 
     def step(self, tick: Tick) -> Verdict:
-        """Judge a tick."""
+        """Return the verdict on a tick."""
         return self.judge(tick, self.examine(tick))
 
     def examine(self, tick: Tick) -> Findings:
-        """Take in a tick, all of it but its setpoint: the first half of `step`, before the actor has chosen."""
+        """Check all of a tick but its setpoint: the first half of `step`, before the actor chooses."""
         findings = self._check_clock(tick) | self._check_people(tick) | self._check_loop(tick)
         return findings | self._take_pose(tick) | self._check_flight() | self._check_lift(tick)
 
     def cuts(self, findings: Findings) -> bool:
-        """Whether they cut a vehicle that flies, whatever it is that the actor would choose."""
+        """Return whether the findings cut an armed vehicle, whatever the actor would choose."""
         return self.armed and bool(findings.keys() - _HOLDING)
 
     def judge(self, tick: Tick, findings: Findings) -> Verdict:
-        """Judge a tick by what was found in it: the second half of `step`."""
+        """Return the verdict on a tick from its findings: the second half of `step`."""
         if self.cuts(findings):
             self.state = State.CUT
         elif self.armed:
@@ -170,7 +170,7 @@ class Safety:
 
     @property
     def lets_through(self) -> bool:
-        """Whether the last tick sent what was wanted: neither arming nor holding."""
+        """Whether the last tick sent the wanted setpoint: neither arming nor holding."""
         return self.state is State.FLYING and not self._arming
 
     @property
@@ -195,12 +195,12 @@ class Safety:
             self._left_at = math.inf
 
     def _command(self, tick: Tick) -> Command:
-        """Return what is sent: the wanted one within its limits, and not faster than they may change."""
+        """Return the command to send: the wanted setpoint, limited in value and in rate of change."""
         if not self.armed:
             self._sent = _IDLE
             return at_rest()
         wanted: Vector | None = _read_setpoint(tick.setpoint)
-        if self._arming:  # no flight controller arms but at its least throttle, whatever limits.thrust_min says
+        if self._arming:  # flight controllers arm at zero throttle only, whatever limits.thrust_min is
             self._sent = _IDLE
             return Command(True, Setpoint(0.0, np.zeros(3)))
         if self.state is State.HOLD or wanted is None:
@@ -218,7 +218,7 @@ class Safety:
         return Command(True, Setpoint(self._sent[0], np.array(self._sent[1:])))
 
     def _forget(self) -> None:
-        """Drop whatever was measured by a clock that cannot be trusted, or that has only begun."""
+        """Reset all that was measured by a clock that has jumped or only just started."""
         self._motion = Motion(self.limits)
         self._measured_at = -math.inf
         self._overruns.clear()
@@ -226,11 +226,11 @@ class Safety:
         self._ready = False  # the enable was released for long enough, and has not been given since
         self._upright_at = self._wanted_at = self._armed_at = self._delivered_at = self._accepted_at = self._now
         self._left_at = math.inf  # when it was first seen to move in this flight
-        self._moved_at = -math.inf  # when it was last
+        self._moved_at = -math.inf  # when it was last seen to move
 
     def _check_clock(self, tick: Tick) -> Findings:
         now = to_number(tick.now)
-        step = now - self._now  # not a number at the first tick
+        step = now - self._now  # NaN at the first tick
         self._now = now
         forwards = 0.0 <= step <= self.limits.tick_max
         self._elapsed = step if forwards else 0.0
@@ -241,7 +241,7 @@ class Safety:
         return {Reason.CLOCK: f"the clock moved by {step:g} s from tick to tick (allowed: {self.limits.tick_max:g})"}
 
     def _check_people(self, tick: Tick) -> Findings:
-        """Ask those who answer for the flight, and remember for how long the enable has been released."""
+        """Check operator, arm request and contract, and note for how long the enable has been released."""
         operator = tick.operator if tick.operator is not None else Operator(enable=False, kill=False)
         findings: Findings = {}
         if operator.kill:
@@ -263,7 +263,7 @@ class Safety:
         return findings
 
     def _check_loop(self, tick: Tick) -> Findings:
-        """Ask whether the loop keeps up, and whether anybody takes its commands."""
+        """Check whether the loop meets its deadlines, and whether link and flight controller accept its commands."""
         limits, overruns = self.limits, self._overruns
         findings: Findings = {}
         overruns.extend([self._now] * tick.loop_overrun)
@@ -284,7 +284,7 @@ class Safety:
         return findings
 
     def _take_pose(self, tick: Tick) -> Findings:
-        """Take in a pose that is newer than the last; one that is not, or is from the future, only grows old."""
+        """Check a pose that is newer than the last; an older one, or one from the future, is ignored."""
         if tick.pose is None:
             return {}
         seen, last = read_pose(tick.pose), self._motion.newest
@@ -321,7 +321,7 @@ class Safety:
         return findings | self._check_stillness()
 
     def _check_stillness(self) -> Findings:
-        """Find poses that are the same to the last digit while it flies, and what is held fast, or lies somewhere."""
+        """Find poses that repeat exactly in flight, and a vehicle that is held fast, or lies somewhere."""
         limits, motion, now = self.limits, self._motion, self._now
         if not self.armed:
             return {}
@@ -337,7 +337,7 @@ class Safety:
         return findings
 
     def _check_lift(self, tick: Tick) -> Findings:
-        """Find what tips over or does not rise while it is lifted, whatever else it seems to do: a lift is blind."""
+        """Find a lifted vehicle that tips over, or does not rise; the lift itself is open-loop."""
         limits, seen = self.limits, self._motion.newest
         if tick.lift is None or not self.armed:
             return {}
@@ -360,7 +360,7 @@ class Safety:
         return {reason: f"the actor has given no usable setpoint for {missing:.3g} s"}
 
     def _check_start(self, tick: Tick) -> Findings:
-        """Return what else speaks against arming: an enable that is not new, a finished flight, or a vehicle astray."""
+        """Return further findings against arming: an enable not released, a finished flight, a wrong start pose."""
         limits, seen = self.limits, self._motion.newest
         findings: Findings = {}
         if tick.finish:

@@ -1,6 +1,6 @@
-"""Every threshold of `safety.Safety`: how far, how fast, how old, and for how long.
+"""All thresholds of `safety.Safety`: distances, speeds, ages and durations.
 
-Where nothing else is said, the numbers are this project's own choice, for a track of some metres in a room.
+Unless noted otherwise, the numbers are this project's own choice, for a track of some metres in a room.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from dreamer_racing.settings import Range, check_settings, setting
 Vector = tuple[float, ...]
 
 BELOW_FLOOR = 0.2
-"""m below a track's floor where its fence ends [choice]: a vehicle that lies there has been measured a little lower."""
+"""m below a track's floor where its fence ends [choice]: a vehicle on the floor may be measured a little lower."""
 
 _SECONDS, _TOLERANCE, _DEGREES = Range(0, 1, open_below=True), Range(0, 10), Range(0, 180, open_below=True)
 _MOST = Range(0, 1e4, open_below=True)
@@ -24,46 +24,46 @@ _MOST = Range(0, 1e4, open_below=True)
 
 @dataclass(frozen=True, kw_only=True)
 class SafetyLimits:
-    """Every threshold of `Safety`. Where the room is has no default.
+    """All thresholds of `Safety`. Fence and start position have no default.
 
     Attributes:
         fence_low: (3,) m, world: lower corner of the box that the vehicle must not leave.
         fence_high: (3,) m, world: its upper corner.
         start_position: (3,) m, world: where the vehicle stands before a flight.
-        start_yaw_degrees: where its nose points then, from world x, left.
+        start_yaw_degrees: its heading then, from world x, positive to the left.
         start_box: m, from the start along each axis, within which it may arm.
-        start_yaw_tolerance_degrees: from its yaw, within which it may arm.
-        start_tilt_degrees: from level, within which it may arm.
-        start_speed: m/s, above which it does not arm, and has left the start when it is armed.
-        release_time: s for which the enable must be seen released before it counts: a flicker begins no flight.
+        start_yaw_tolerance_degrees: difference from that heading within which it may arm.
+        start_tilt_degrees: tilt from level within which it may arm.
+        start_speed: m/s above which it does not arm, or, when armed, counts as having left the start.
+        release_time: s for which the enable must be released before it counts: a flicker starts no flight.
         arm_time: s after arming in which no thrust is sent: Betaflight arms at low throttle only.
-        hold_after: s, age of a pose above which it holds.
-        cut_after: s, age of a pose, time in which poses repeat, or in which there is no setpoint or the link takes
-            none, above which it cuts.
-        refusal_time: s for which the flight controller may say in flight that it does not fly what it is told: it is
+        hold_after: s, age of the newest pose above which safety holds.
+        cut_after: s above which safety cuts, for the age of the newest pose, the time in which poses repeat, and the
+            time without a setpoint or without a command accepted by the link.
+        refusal_time: s for which the flight controller may report in flight that it does not follow commands; it is
             asked with every fifth command.
-        tick_max: s from tick to tick above which the clock has jumped, or the loop has stood still, see `hil.watchdog`.
+        tick_max: s from tick to tick above which the clock has jumped, or the loop has stalled, see `hil.watchdog`.
         overruns_max: deadlines that the loop may miss within `overrun_window`; a long tick misses several.
         overrun_window: s.
-        clock_drift_max: ppm, by which the clock of a sender of stamped poses may go slower, see `stamping.PoseClock`.
+        clock_drift_max: ppm by which the clock of a pose sender may run slower than ours, see `stamping.PoseClock`.
         speed_max: m/s. On Figure 8 in simulation the included agent reaches 12.4, the scripted pilot 12.7.
         jump_tolerance: m by which two poses may be further apart than `speed_max` allows in the time between them.
-        turn_rate_max: rad/s, about whatever axis: what a vehicle can turn at between two poses.
+        turn_rate_max: rad/s about any axis, fastest possible turn between two poses.
         turn_tolerance_degrees: by which two attitudes may be further apart than `turn_rate_max` allows.
-        velocity_tolerance: m/s by which the velocities that poses claim may differ from those of their positions.
-        rate_tolerance: rad/s by which the body rates that poses claim may differ from those of their attitudes, as long
-            as no two poses are more than ``hold_after`` apart.
+        velocity_tolerance: m/s by which reported velocities may differ from those of the positions.
+        rate_tolerance: rad/s by which reported body rates may differ from those of the attitudes, as long as no two
+            poses are more than ``hold_after`` apart.
         velocity_window: s over which both are compared, see `hil.odometer`.
-        tilt_max_degrees: from level, that may be exceeded for `tilt_time` only.
+        tilt_max_degrees: tilt from level that may be exceeded for `tilt_time` only.
         tilt_time: s.
-        still_time: s without more than `start_speed` after which what has flown counts as crashed: racers never hover.
-        lift_off_time: s after arming by which it must have moved: what is held fast must not spin on.
-        lift_time: s of a lift off the stand by which it must have been seen to rise: until then the lift is blind.
+        still_time: s below `start_speed` after which a vehicle that has flown counts as crashed: racers never hover.
+        lift_off_time: s after arming by which it must have moved: a vehicle that is held fast must stop its motors.
+        lift_time: s of a lift off the stand by which a rise must have been seen: until then the lift is open-loop.
         thrust_min: m/s², least collective thrust in flight.
-        thrust_max: m/s², largest.
-        thrust_slew: m/s³, how fast it may change; the default lets the shipped actors swing fully in a tick of 25 Hz.
-        rate_max: (3,) rad/s, largest body rates about x, y, z: those of the shipped actors.
-        rate_slew: rad/s², how fast each may change; as `thrust_slew`.
+        thrust_max: m/s², largest collective thrust.
+        thrust_slew: m/s³, how fast thrust may change; by default the included actors may use its full range in 1/25 s.
+        rate_max: (3,) rad/s, largest body rates about x, y, z: those of the included actors.
+        rate_slew: rad/s², how fast each body rate may change; default as for `thrust_slew`.
     """
 
     fence_low: Vector
@@ -103,10 +103,10 @@ class SafetyLimits:
 
     @classmethod
     def of_track(cls, track: Track, **changed: Any) -> Self:
-        """Return the limits for a track: its box, with room for a stand below its floor, and its start.
+        """Return the limits for a track: its bounds, lowered by `BELOW_FLOOR`, and its start.
 
         Raises:
-            ValueError: There is no limit of a name.
+            ValueError: A name in ``changed`` is no limit.
         """
         names = {field.name for field in fields(cls)}
         if unknown := sorted(set(changed) - names):
@@ -121,11 +121,11 @@ class SafetyLimits:
         return cls(**{**own, **{name: tuple(v) if isinstance(v, list) else v for name, v in changed.items()}})
 
     def reach(self, elapsed: float) -> float:
-        """Return how far apart two poses may be, m, of which one is so many seconds after the other."""
+        """Return the largest distance, m, allowed between two poses that are ``elapsed`` s apart."""
         return self.speed_max * elapsed + self.jump_tolerance
 
     def check(self) -> None:
-        """Refuse limits that protect nothing, or that nothing can fly within.
+        """Refuse limits that give no protection, or that make flight impossible.
 
         Raises:
             ValueError: The message gives the limit, its value, and what is allowed.
@@ -153,7 +153,7 @@ class SafetyLimits:
 
 
 def to_number(value: Any) -> float:
-    """Return a number, or not-a-number for what is none."""
+    """Return a value as a float, NaN if it is not a number."""
     try:
         return float(value)
     except (TypeError, ValueError, OverflowError):
@@ -161,7 +161,7 @@ def to_number(value: Any) -> float:
 
 
 def to_numbers(values: Any, count: int) -> Vector | None:
-    """Return so many finite numbers, or None."""
+    """Return ``count`` finite numbers; None if the values are not that."""
     try:
         numbers = tuple(to_number(value) for value in values)
     except TypeError:

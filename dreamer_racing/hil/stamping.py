@@ -1,7 +1,7 @@
-"""When a pose was measured, by the loop's own clock, and where the vehicle is by now.
+"""Estimates when a pose was measured, by the loop's clock, and extrapolates it to the present.
 
-A motion-capture system stamps poses with a clock of its own, and the network delays them by more or less. What is known
-is when a packet arrived; what is wanted is when it was measured.
+A motion-capture system stamps poses with its own clock, and the network delays them by varying times. It is known when
+a packet arrived, but not when its pose was measured.
 """
 
 from __future__ import annotations
@@ -15,28 +15,28 @@ from dreamer_racing.hil.safety_limits import SafetyLimits
 from dreamer_racing.hil.vehicle import Pose
 
 SILENCE = 0.5
-"""s without a packet after which a sender may begin anew, with lower numbers [choice]; the vehicle is cut by then."""
+"""s without packets after which a sender may restart with lower numbers [choice]; motors are cut by then."""
 
 
 class Stamping(Enum):
-    """What a pose's time is."""
+    """How the measurement time of a pose is determined."""
 
-    receive = "receive"  # when it arrived, less a fixed latency
-    sender = "sender"  # the sender's stamp, put on our clock by the least delay so far
+    receive = "receive"  # arrival time minus a fixed latency
+    sender = "sender"  # the sender's timestamp, mapped to our clock by the least delay so far
 
 
 class PoseClock:
-    """Puts packets on the loop's clock.
+    """Converts the times of packets to the loop's clock.
 
     Args:
-        stamping: How.
-        latency: s, of the least delayed packet from measurement to arrival: what no stamp shows.
-        drift_max: ppm, by which the sender's clock may go slower than ours. The least delay is forgotten no faster
-            than this accounts for: what grows faster is delay, and poses become that much older.
+        stamping: Method of conversion.
+        latency: s from measurement to arrival of the least delayed packet, which timestamps cannot show.
+        drift_max: ppm by which the sender's clock may run slower than ours. The assumed least delay grows at most this
+            fast; faster growth is taken as network delay, which makes poses older.
 
     Attributes:
-        out_of_order: Packets so far that were older than one before, or the same again, or of a clock that was set back
-            more than once in half a second; they are left out.
+        out_of_order: Number of packets ignored so far: older than one before, repeated, or of a clock that was set back
+            more than once in half a second.
     """
 
     def __init__(self, stamping: Stamping, latency: float, drift_max: float = SafetyLimits.clock_drift_max) -> None:
@@ -44,15 +44,15 @@ class PoseClock:
         self.latency = latency
         self.out_of_order = 0
         self._drift_max = 1e-6 * drift_max
-        self._offset = math.inf  # s, arrival less stamp of the least delayed packet
+        self._offset = math.inf  # s, arrival time minus timestamp of the least delayed packet
         self._newest: Received | None = None
-        self._set_back_at = -math.inf  # s, when the sender's clock was last
-        self._latest = -math.inf  # s, of the poses so far
+        self._set_back_at = -math.inf  # s, when the sender's clock was last set back
+        self._latest = -math.inf  # s, newest measurement time so far
 
     def read(self, received: Received) -> Pose | None:
         """Return the pose of a packet; None if its number is not newer than the newest one's, or its time is older.
 
-        Only after a silence may numbers and stamps begin anew: else a replayed packet would be taken for a new sender.
+        Numbers and timestamps may restart only after a silence: else a replayed packet would pass for a new sender.
         """
         packet = received.packet
         if self._newest is not None:
@@ -66,13 +66,13 @@ class PoseClock:
             if waited >= SILENCE:
                 self._offset = math.inf  # it may be another clock
             elif set_back:
-                # What waits in a queue is as old as what came before it, until it shows to be less.
+                # Assume the same delay as of the packet before, until a less delayed packet arrives.
                 self._offset += self._newest.packet.stamp + waited - packet.stamp
                 self._set_back_at = received.time
             self._offset += self._drift_max * waited
         self._newest = received
         measured = self._measured(received)
-        if measured < self._latest:  # a packet that was delayed less tells more of the clocks; its pose is an older one
+        if measured < self._latest:  # a less delayed packet improved the clock offset, but its pose is older
             self.out_of_order += 1
             return None
         self._latest = measured
@@ -86,11 +86,11 @@ class PoseClock:
 
 
 def extrapolate(pose: Pose, time: float) -> Pose:
-    """Return where the vehicle is by then, if it goes on as it did: with its velocity, turning with its body rates.
+    """Extrapolate a pose to a time, with constant velocity and body rates.
 
     Args:
-        pose: As measured.
-        time: s, by the loop's clock; before the pose's own, the pose is returned as it is.
+        pose: The measured pose.
+        time: s, by the loop's clock; if before the pose's own time, the pose is returned unchanged.
     """
     elapsed = time - pose.time
     if elapsed <= 0.0:

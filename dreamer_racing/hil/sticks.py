@@ -1,13 +1,13 @@
-"""From setpoints to the sticks of a radio, which is what a Betaflight flight controller is flown with, and back.
+"""Converts setpoints to the sticks of a radio, by which a Betaflight flight controller is flown, and back.
 
-Rates and thrust are mapped apart: `RateMap` says what the flight controller makes of the sticks and stays as it is
-configured, `ThrustMap` says what motors and battery make of the throttle and changes in flight.
+Rates and thrust are mapped separately: `RateMap` is the flight controller's map from sticks to rates, fixed by its
+configuration; `ThrustMap` is the map from throttle to thrust of motors and battery, which changes in flight.
 
 | stick | +1 means | in `Setpoint` | channel |
 |---|---|---|---|
 | roll | roll right | +x | 1 |
 | pitch | stick forward, nose down | +y | 2 |
-| throttle, 0 to 1 | all of it | +collective thrust | 3 |
+| throttle, 0 to 1 | full throttle | +collective thrust | 3 |
 | yaw | yaw right | −z | 4 |
 
 Reference: Betaflight, src/main/fc/rc.c (rates, throttle) and src/main/flight/mixer.c (motor idle).
@@ -35,13 +35,13 @@ _PHYSICAL = Range(0, 1e4, open_below=True)
 
 
 class Sticks(NamedTuple):
-    """Where the sticks are.
+    """Stick positions.
 
     Args:
         roll: In [−1, 1], + right.
         pitch: In [−1, 1], + forward.
         yaw: In [−1, 1], + right.
-        throttle: In [0, 1], the share of its way: 1000 µs to 2000 µs.
+        throttle: In [0, 1], from 1000 µs to 2000 µs.
     """
 
     roll: float
@@ -52,7 +52,7 @@ class Sticks(NamedTuple):
 
 @dataclass(frozen=True)
 class RateMap:
-    """What body rates the sticks ask for: so much of the largest, linearly.
+    """The linear map from stick positions to body rates.
 
     In Betaflight: ``rates_type = ACTUAL``, expo 0, and rc_rate and srate both a tenth of the largest rate in deg/s.
 
@@ -85,7 +85,7 @@ class RateMap:
         check_settings(self, "RateMap.")
 
     def to_sticks(self, body_rates: np.ndarray) -> tuple[float, float, float]:
-        """Return roll, pitch and yaw stick for body rates (3,) in rad/s; full stick where they are larger."""
+        """Return roll, pitch and yaw stick for body rates (3,) in rad/s; full stick if they are larger."""
         roll, pitch, yaw = (float(rate) for rate in body_rates)
         return _clamp(roll / self.roll, -1, 1), _clamp(pitch / self.pitch, -1, 1), _clamp(-yaw / self.yaw, -1, 1)
 
@@ -96,7 +96,7 @@ class RateMap:
 
 @dataclass(frozen=True)
 class ThrustMap:
-    """What thrust a throttle makes: that of the motors' command squared, and of the battery's voltage squared.
+    """The map from throttle to thrust, proportional to the squares of motor command and battery voltage.
 
     ``motor = idle + (1 − idle) (µs − min_check) / (2000 − min_check)``, and
     ``thrust = full_thrust (voltage / reference_voltage)² motor²``.
@@ -104,8 +104,8 @@ class ThrustMap:
     Attributes:
         mass: kg, with battery.
         full_thrust: N, of all motors at full command and the reference voltage, as measured on a stand.
-        reference_voltage: V, the battery's under that load.
-        voltage: V, the battery's now; `dataclasses.replace` keeps it up to date, see `hil.battery`.
+        reference_voltage: V, of the battery under that load.
+        voltage: V, of the battery now; `at` updates it, see `hil.battery`.
         idle: Motor command at throttle 0: Betaflight's motor_idle (dshot_idle_value).
         min_check: µs, the channel's value up to which the throttle counts as 0.
 
@@ -129,7 +129,7 @@ class ThrustMap:
         self.check()
 
     def check(self) -> None:
-        """Refuse what no drone that flies is like.
+        """Refuse values that no flying drone has.
 
         Raises:
             ValueError: The message gives the field, its value, and what is allowed.
@@ -150,19 +150,19 @@ class ThrustMap:
 
     @property
     def _voltage_ends(self) -> tuple[float, float]:
-        """Least and largest voltage of a battery that the reference may be of, V."""
+        """Least and largest voltage that is plausible for the reference voltage, V."""
         return 0.5 * self.reference_voltage, 1.5 * self.reference_voltage
 
     def at(self, voltage: float) -> Self:
-        """Return the map at another voltage, V, or at the nearest for which it can be (`check`): this never raises.
+        """Return the map at another voltage, V, or at the nearest one that `check` allows; this never raises.
 
-        Below the voltage at which motors just lift the drone it stays there; what is not finite changes nothing.
+        A voltage too low to lift the drone counts as one that just does; a non-finite one changes nothing.
         """
         if not math.isfinite(voltage):
             return self
         low, high = self._voltage_ends
         lifting = self.reference_voltage * math.sqrt(GRAVITY * self.mass / self.full_thrust) * (1.0 + 1e-6)
-        low = max(low, min(lifting, self.voltage))  # the voltage of now is one that it can be at
+        low = max(low, min(lifting, self.voltage))  # the present voltage is allowed
         return replace(self, voltage=_clamp(voltage, low, high))
 
     @property
@@ -171,13 +171,13 @@ class ThrustMap:
         return self.full_thrust * (self.voltage / self.reference_voltage) ** 2 / self.mass
 
     def to_motor(self, collective_thrust: float) -> float:
-        """Return the motor command in [0, 1] for a collective thrust in m/s²; 1 where it is more than there is."""
+        """Return the motor command in [0, 1] for a collective thrust in m/s²; 1 if that exceeds the largest."""
         return math.sqrt(_clamp(collective_thrust / self.collective_thrust_max, 0, 1))
 
     def to_sticks(self, collective_thrust: float) -> float:
         """Return the throttle in [0, 1] for a collective thrust in m/s².
 
-        Thrust below that of idling motors is a throttle below ``min_check``, as arming in Betaflight needs it.
+        Thrust below that of idling motors gives a throttle below ``min_check``, which Betaflight needs for arming.
         """
         share = (self.to_motor(collective_thrust) - self.idle) / (1 - self.idle)
         return _clamp((self.min_check + share * (HIGHEST - self.min_check) - LOWEST) / (HIGHEST - LOWEST), 0, 1)
@@ -190,7 +190,7 @@ class ThrustMap:
 
 
 def to_sticks(setpoint: Setpoint, rates: RateMap, thrust: ThrustMap) -> Sticks:
-    """Return the sticks that ask for a setpoint, or for what comes closest to it."""
+    """Return the sticks that ask for a setpoint, or for the nearest possible one."""
     return Sticks(*rates.to_sticks(setpoint.body_rates), thrust.to_sticks(setpoint.collective_thrust))
 
 
@@ -200,16 +200,16 @@ def from_sticks(sticks: Sticks, rates: RateMap, thrust: ThrustMap) -> Setpoint:
 
 
 def channels(command: Command, rates: RateMap, thrust: ThrustMap, arm_channel: int = FIRST_SWITCH) -> tuple[float, ...]:
-    """Return the 16 channels of a radio that ask for a command.
+    """Return the 16 radio channels of a command.
 
-    The order is Betaflight's ``map AETR1234``: roll, pitch, throttle, yaw, AUX1, … Where the command is not armed,
-    the throttle is down and the other sticks are centred, whatever the setpoint.
+    The order is Betaflight's ``map AETR1234``: roll, pitch, throttle, yaw, AUX1, … If the command is not armed, the
+    throttle is down and the other sticks are centred, whatever the setpoint.
 
     Args:
-        command: What to do; the setpoint's numbers are finite where it is armed.
-        rates: What the flight controller makes of roll, pitch and yaw.
-        thrust: What it makes of the throttle.
-        arm_channel: Index of the switch that arms: 2000 µs when armed, 1000 µs otherwise, as all other switches always.
+        command: The command; if it is armed, its setpoint must be finite.
+        rates: Map of roll, pitch and yaw.
+        thrust: Map of the throttle.
+        arm_channel: Index of the arm switch: 2000 µs if armed, else 1000 µs; all other switches are always at 1000 µs.
 
     Returns:
         (16,) µs in [1000, 2000], not rounded.

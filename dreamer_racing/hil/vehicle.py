@@ -1,4 +1,4 @@
-"""What is known of the vehicle and what is asked of it: the two ends of every flight, in SI units.
+"""The vehicle's interface in SI units: poses (measured), setpoints and commands (sent), and the `Link` protocol.
 
 World frame z up; body frame FLU (x forward, y left, z up), right-handed: +x rolls right, +y pitches the nose down,
 +z yaws left. Attitudes are wxyz, body → world.
@@ -16,7 +16,7 @@ from dreamer_racing.hil.imu import ImuReading
 
 
 class Pose(NamedTuple):
-    """Where the vehicle was, and how it moved, at a time.
+    """The vehicle's position, attitude and velocities at one time.
 
     Args:
         time: s, on the clock of the loop (``time.monotonic``).
@@ -34,7 +34,7 @@ class Pose(NamedTuple):
 
 
 class Setpoint(NamedTuple):
-    """What the flight controller is asked to do.
+    """The thrust and body rates that the flight controller is asked for.
 
     Args:
         collective_thrust: m/s² along body +z, thrust divided by mass; at least 0.
@@ -49,8 +49,8 @@ class Command(NamedTuple):
     """One message to the vehicle.
 
     Args:
-        armed: Whether motors may turn at all; where not, a link says so in its own way whatever the setpoint is.
-        setpoint: What is asked for.
+        armed: Whether motors may turn. If not, a link sends its protocol's disarmed command and ignores the setpoint.
+        setpoint: Thrust and body rates.
     """
 
     armed: bool
@@ -63,34 +63,34 @@ def hover() -> Setpoint:
 
 
 def at_rest() -> Command:
-    """Return the command with which a vehicle stays on the ground: disarmed, no thrust."""
+    """Return the command that keeps a vehicle on the ground: disarmed, no thrust."""
     return Command(False, Setpoint(0.0, np.zeros(3)))
 
 
 class Link(Protocol):
-    """Carries commands to a vehicle, and back what it says of its battery, of its IMU and of itself."""
+    """Sends commands to a vehicle, and receives its battery voltages, IMU samples and status."""
 
     @property
     def refusal(self) -> str:
-        """Why the flight controller does not fly what it is told, or would not; empty as far as is known."""
+        """Why the flight controller does not follow commands, or would not if armed; empty if no reason is known."""
         ...
 
     def send(self, command: Command) -> bytes:
-        """Send a command now, without waiting; return the bytes that went out, none if it was dropped."""
+        """Send a command without blocking; return the bytes sent, none if it was dropped."""
         ...
 
     def listen(self) -> list[Reading]:
-        """Return the battery's voltages that have come back since the last call, oldest first, without waiting."""
+        """Return the battery voltages received since the last call, oldest first, without blocking."""
         ...
 
     def feel(self) -> list[ImuReading]:
-        """Return what the vehicle's IMU told until the last `listen`, oldest first; asked of links that hear one."""
+        """Return the IMU samples received up to the last `listen`, oldest first; called only if the flyer uses them."""
         ...
 
     def reckon_with(self, voltage: float) -> None:
-        """Turn thrust into a throttle by a voltage, V, from now on; nothing where thrust is sent as it is."""
+        """Convert thrust to throttle by this voltage, V, from now on; no effect if thrust is sent in SI units."""
         ...
 
     def close(self) -> None:
-        """Give back socket or device; may be called twice."""
+        """Close the socket or device; may be called twice."""
         ...

@@ -1,4 +1,4 @@
-"""How fast a vehicle moves and turns, from where it was: for sources that measure poses only."""
+"""Estimates velocities and body rates from successive poses, for sources that measure poses only."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import numpy as np
 from dreamer_racing.hil.attitude import rotation_between
 
 GAP = 0.1
-"""s between two poses beyond which the difference says nothing about now [choice]."""
+"""s between two poses beyond which their difference says nothing about the present velocity [choice]."""
 
 SPEED_MAX = 50.0
 """m/s above which a pose has jumped instead of moved [choice]: more than twice what racing drones reach."""
@@ -20,7 +20,7 @@ RATE_MAX = 50.0
 
 
 class Velocity(NamedTuple):
-    """How a vehicle moves.
+    """A vehicle's velocity and body rates.
 
     Args:
         linear_velocity: (3,) m/s, world.
@@ -32,13 +32,13 @@ class Velocity(NamedTuple):
 
 
 class VelocityEstimator:
-    """Differences of successive poses, through a first-order low-pass.
+    """Differentiates successive poses, and smooths the result with a first-order low-pass.
 
-    The filter starts at the first difference, so that steady motion is known exactly from the second pose on. What
-    comes out is late by half the time between two poses, and by the time constant.
+    The filter starts at the first difference, so that steady motion is known exactly from the second pose on. The
+    estimate lags by half the time between two poses, plus the time constant.
 
     Args:
-        time_constant: s, of the low-pass: after it, 63 % of a step have come through; 0: there is no filter.
+        time_constant: s, of the low-pass, after which 63 % of a step has passed; 0 disables the filter.
 
     Example:
         >>> level = np.array([1.0, 0.0, 0.0, 0.0])
@@ -55,7 +55,7 @@ class VelocityEstimator:
         self._velocity: Velocity | None = None
 
     def update(self, time: float, position: np.ndarray, attitude: np.ndarray) -> Velocity | None:
-        """Take in a pose, and return how the vehicle moves.
+        """Add a pose, and return the vehicle's velocity and body rates.
 
         Args:
             time: s, when the pose was measured.
@@ -63,7 +63,7 @@ class VelocityEstimator:
             attitude: (4,) wxyz, unit length; of either sign.
 
         Returns:
-            None for the first pose, and for one after a gap or a jump or a step back in time, which is a first one too.
+            None for the first pose, and after a gap, a jump or a step back in time, where estimation starts anew.
         """
         last, self._last = self._last, (time, position, attitude)
         elapsed = math.inf if last is None else time - last[0]
@@ -80,5 +80,5 @@ class VelocityEstimator:
     def _filtered(self, measured: Velocity, elapsed: float) -> Velocity:
         if self._velocity is None or self._time_constant == 0.0:
             return measured
-        gain = -math.expm1(-elapsed / self._time_constant)  # exact for an input that is constant meanwhile
+        gain = -math.expm1(-elapsed / self._time_constant)  # exact for a constant input
         return Velocity(*(old + gain * (new - old) for old, new in zip(self._velocity, measured, strict=True)))

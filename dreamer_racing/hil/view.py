@@ -1,7 +1,7 @@
-"""A page on which people see what the actor sees while it flies: image, state, target gate, speed.
+"""A web page that shows a flight live: the actor's image, state, target gate and speed.
 
-`LiveView.show` is for `FlightLoop`'s ``watch``. It copies a frame into memory that a process of its own reads, and
-waits for nobody; that process serves the page, at the lowest priority, and is this file run as a script:
+`LiveView.show` is one of `FlightLoop`'s ``watchers``. Without waiting, it copies a frame into shared memory. A separate
+process at the lowest priority reads it and serves the page; it is this file run as a script:
 
 | path | what |
 |---|---|
@@ -10,9 +10,9 @@ waits for nobody; that process serves the page, at the lowest priority, and is t
 | ``/image.jpg`` | the newest one |
 | ``/state`` | the newest numbers (JSON) |
 
-A frame in memory, little endian: count u32, odd while it is being written, bytes of numbers u32, their CRC-32 u32,
-bytes of image u32, numbers (marshal: both ends are of one Python), image (uint8 RGB). One whose count has changed
-meanwhile is read again.
+A frame in memory, little endian: count u32 (odd while it is being written), size of numbers u32, their CRC-32 u32, size
+of image u32, numbers (marshal: both ends run the same Python), image (uint8 RGB). A reader that finds the count changed
+reads the frame again.
 """
 
 from __future__ import annotations
@@ -38,18 +38,18 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-if TYPE_CHECKING:  # the process that serves needs none of it
+if TYPE_CHECKING:  # not needed by the serving process
     from dreamer_racing.hil.chain import Outputs
 
 logger = logging.getLogger(__name__)
 
 PORT = 9103
 ROOM = 1 << 22
-"""Bytes of a frame at most [choice]: images of up to a thousand pixels in square."""
+"""Largest size of a frame, bytes [choice]: images of up to 1000 × 1000 pixels."""
 SHOWN_WIDTH = 512
-"""Pixels to which images are enlarged, by a whole factor [choice]."""
+"""Width in pixels to which images are enlarged, by a whole factor [choice]."""
 STREAM_RATE = 30.0
-"""Hz of images at most [choice]."""
+"""Largest rate of images, Hz [choice]."""
 SILENCE = 1.0
 """s without a tick after which the page says so [choice]."""
 
@@ -62,12 +62,12 @@ class LiveView:
     """Serves the page for as long as it is open.
 
     Args:
-        port: Of the page; 0 for a free one.
-        host: Address to listen on; other machines see the page only if this says so.
+        port: Port of the page; 0 picks a free one.
+        host: Address to listen on; by default only this machine sees the page.
 
     Attributes:
-        address: Of the page, as a browser takes it.
-        too_large: Images so far that had no room in a frame, and were left out.
+        address: URL of the page.
+        too_large: Number of images so far that were too large for a frame, and were left out.
 
     Raises:
         OSError: The port is in use, or the page cannot be served; the message says which.
@@ -87,7 +87,7 @@ class LiveView:
         try:
             self.address = f"http://{host}:{listening.getsockname()[1]}/"
             self._memory = mmap.mmap(descriptor, ROOM)
-            self._memory[:] = bytes(ROOM)  # touched now, so that no page is missing in flight
+            self._memory[:] = bytes(ROOM)  # touched now, to avoid page faults in flight
             self._server = _start_server(descriptor, listening)
         finally:
             listening.close()
@@ -96,7 +96,7 @@ class LiveView:
             logger.warning("view: it listens on %s: everyone who reaches that address sees the flight", host)
 
     def show(self, outputs: Outputs) -> None:
-        """Show what came of a tick, without waiting."""
+        """Show the outputs of a tick, without blocking."""
         if self._memory.closed:
             return
         image, memory = outputs.image, self._memory
@@ -132,13 +132,13 @@ class LiveView:
         }
 
     def close(self) -> None:
-        """End the page; may be called twice."""
+        """Stop serving the page; may be called twice."""
         if self._memory.closed:
             return
         self._memory.close()
         assert self._server.stdin is not None
         assert self._server.stdout is not None
-        self._server.stdin.close()  # what it waits for
+        self._server.stdin.close()  # the server ends with its input
         try:
             self._server.wait(timeout=2.0)
         except subprocess.TimeoutExpired:
@@ -150,7 +150,7 @@ class LiveView:
 def _listen(host: str, port: int) -> socket.socket:
     """Return a socket to which browsers can connect."""
     listening = socket.socket(socket.AF_INET, socket.SOCK_STREAM)
-    listening.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)  # a page of a moment ago is no other program
+    listening.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)  # a page closed just before may hold the port
     try:
         listening.bind((host, port))
         listening.listen(16)
@@ -162,7 +162,7 @@ def _listen(host: str, port: int) -> socket.socket:
 
 
 def _memory_file() -> int:
-    """Return the descriptor of a file of `ROOM` bytes that has no name and, where that is possible, no disk."""
+    """Return the descriptor of an unnamed file of `ROOM` bytes, in memory if possible."""
     if hasattr(os, "memfd_create"):
         descriptor = os.memfd_create("dreamer_racing_view")
     else:
@@ -173,15 +173,15 @@ def _memory_file() -> int:
 
 
 def _start_server(memory: int, listening: socket.socket) -> subprocess.Popen[bytes]:
-    """Start the process that serves, and wait until it does.
+    """Start the serving process, and wait until it is ready.
 
     Raises:
-        OSError: It does not.
+        OSError: It does not start.
     """
     shared = (memory, listening.fileno())
-    # By its path, so that it imports nothing of the flight; -P, because modules beside this file have names of others.
+    # Run by path, so that it imports nothing of the flight; -P, because files beside this one shadow standard modules.
     command = [sys.executable, "-P", os.path.abspath(__file__), *map(str, shared)]
-    # In a session of its own: Ctrl-C in the terminal is for the flight.
+    # In its own session: Ctrl-C in the terminal is for the flight.
     server = subprocess.Popen(
         command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, pass_fds=shared, start_new_session=True
     )
@@ -198,15 +198,15 @@ def _start_server(memory: int, listening: socket.socket) -> subprocess.Popen[byt
     return server
 
 
-# --- in the process that serves ---
+# --- in the serving process ---
 
 
 class Frame(NamedTuple):
-    """A frame that was read.
+    """A frame read from memory.
 
     Args:
-        numbers: What `LiveView` says of a tick.
-        pixels: As they are in memory; none without an image.
+        numbers: The values of a tick, from `LiveView`.
+        pixels: Raw bytes of the image; empty without one.
     """
 
     numbers: dict[str, Any]
@@ -214,15 +214,15 @@ class Frame(NamedTuple):
 
 
 def read_frame(memory: mmap.mmap, tries: int = 20) -> Frame | None:
-    """Return the newest frame; None if there is none yet, or each try met one being written."""
+    """Return the newest frame; None if there is none yet, or it was being written at each try."""
     for _ in range(tries):
         count, length, check, size = _HEAD.unpack_from(memory)
         if not length:
             return None
         middle = _HEAD.size + length
         numbers, pixels = memory[_HEAD.size : middle], memory[middle : middle + size]
-        # The CRC is for machines on which another process sees writes in another order: pixels may then be of two
-        # images, but what is parsed is whole.
+        # The CRC is for machines on which other processes may see writes out of order: pixels may then mix two images,
+        # but the parsed numbers are intact.
         if not count % 2 and _COUNT.unpack_from(memory)[0] == count and zlib.crc32(numbers) == check:
             return Frame(marshal.loads(numbers), pixels)
         time.sleep(0.0005)
@@ -230,7 +230,7 @@ def read_frame(memory: mmap.mmap, tries: int = 20) -> Frame | None:
 
 
 def enlarged(frame: Frame) -> bytes:
-    """Return the image as JPEG, each pixel a square; grey where there is none."""
+    """Return the image as JPEG, each pixel as a square; a grey one if there is none."""
     from PIL import Image
 
     shape = frame.numbers["shape"]
@@ -246,7 +246,7 @@ def enlarged(frame: Frame) -> bytes:
 
 
 def described(frame: Frame | None) -> str:
-    """Return the numbers for people, a line each."""
+    """Return the values as text, one per line."""
     if frame is None:
         return "no tick yet"
     numbers = frame.numbers
@@ -290,13 +290,13 @@ look();
 
 
 class _Page(BaseHTTPRequestHandler):
-    """Answers browsers."""
+    """Handles requests of browsers."""
 
     memory: mmap.mmap
     timeout = 5.0  # s that a browser may take
 
     def do_GET(self) -> None:
-        """Answer."""
+        """Answer a request."""
         answer = {"/": self._page, "/state": self._state, "/image.jpg": self._image, "/stream": self._stream}
         try:
             answer.get(self.path.partition("?")[0], self._nothing)()
@@ -304,7 +304,7 @@ class _Page(BaseHTTPRequestHandler):
             self.close_connection = True  # the browser has gone
 
     def log_message(self, format: str, *args: Any) -> None:
-        """Say nothing: the terminal is the flight's."""
+        """Log nothing: the terminal belongs to the flight."""
 
     def _page(self) -> None:
         text = _PAGE.format(width=SHOWN_WIDTH, text=html.escape(described(read_frame(self.memory))))
@@ -326,7 +326,7 @@ class _Page(BaseHTTPRequestHandler):
         self.send_error(404)
 
     def _stream(self) -> None:
-        """Send each image that is new, for as long as the browser takes them."""
+        """Send each new image until the browser disconnects."""
         self.send_response(200)
         self.send_header("Content-Type", f"multipart/x-mixed-replace; boundary={_BOUNDARY}")
         self.send_header("Cache-Control", "no-store")
@@ -351,7 +351,7 @@ class _Page(BaseHTTPRequestHandler):
 
 
 class _Server(ThreadingHTTPServer):
-    """Says nothing of browsers that go while they are answered."""
+    """Ignores browsers that disconnect during an answer."""
 
     def handle_error(self, request: Any, client_address: Any) -> None:
         if not isinstance(sys.exception(), (ConnectionError, TimeoutError)):
@@ -359,11 +359,11 @@ class _Server(ThreadingHTTPServer):
 
 
 def serve(memory: int, listening: int) -> None:
-    """Serve the page until standard input ends, which it does with the flight's process, however that ends.
+    """Serve the page until standard input closes, which happens when the flight's process ends for any reason.
 
     Args:
         memory: Descriptor of the frame's file.
-        listening: Of the socket.
+        listening: Descriptor of the listening socket.
     """
     import PIL.Image  # noqa: F401  # what is missing is to be missed now
 

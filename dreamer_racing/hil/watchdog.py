@@ -1,8 +1,8 @@
-"""Who disarms the vehicle when the loop hangs: a thread that has only the link.
+"""A watchdog thread that disarms the vehicle when the flight loop hangs.
 
-A tick may hang in a graphics driver or in an inference library, where Python runs no signal handler. Both are called
-without Python's lock, so that other threads run on. Where something hangs with the lock held, or the process is stopped
-or killed, nothing in it helps: then the flight controller's failsafe is the only guard.
+A tick may hang in a graphics driver or an inference library, where Python runs no signal handler. Both are called with
+the GIL released, so that other threads continue. If something hangs while it holds the GIL, or if the process is
+stopped or killed, the watchdog cannot act: then the flight controller's failsafe is the only protection.
 """
 
 from __future__ import annotations
@@ -13,23 +13,23 @@ from threading import Event, Lock, Thread
 from dreamer_racing.hil.vehicle import Command, Link, at_rest
 
 CHECKS = 10
-"""How often the thread looks within the time after which it acts [choice]: it acts a tenth later at most."""
+"""Checks per timeout [choice]: the thread acts at most a tenth of the timeout late."""
 
 
 class Watchdog:
-    """Sends commands for the loop, and disarms the vehicle once the loop has sent none for too long.
+    """Sends the loop's commands, and disarms the vehicle once the loop has sent none for too long.
 
-    It sends disarm frames then until it is closed, and turns into one whatever the loop, should it come back, still
-    wants to send. One command is sent at a time, by whichever of the two.
+    It then sends disarm frames until it is closed; if the loop recovers, its armed commands are replaced by disarm
+    frames. A lock lets only one of loop and thread send at a time.
 
     Args:
-        link: To the vehicle.
-        longest: s from an armed command to the next one.
-        now: The loop's clock, s; what passes on it while the loop sleeps or works counts.
+        link: Link to the vehicle.
+        longest: s allowed from an armed command to the next command.
+        now: Returns the time of the loop's clock, s, which also runs while the loop sleeps.
 
     Attributes:
-        acted: Whether it had to.
-        error: What its last frame met, if it did not go out.
+        acted: Whether it has taken over to disarm the vehicle.
+        error: Error of its last disarm frame; None if that was sent.
     """
 
     def __init__(self, link: Link, longest: float, now: Callable[[], float]) -> None:
@@ -38,10 +38,10 @@ class Watchdog:
         self._link, self._longest, self._now = link, longest, now
         self._armed_at: float | None = None  # when the last command was sent, if that was an armed one
         self._sending, self._closed = Lock(), Event()
-        self._thread: Thread | None = None  # begun with the first armed command: until then there is nothing to watch
+        self._thread: Thread | None = None  # started with the first armed command: until then there is nothing to watch
 
     def send(self, command: Command) -> bytes:
-        """Send a command now, as `Link.send` does; at rest if it has acted."""
+        """Send a command as `Link.send` does; a disarmed one instead if the watchdog has acted."""
         with self._sending:
             if command.armed and self._is_late():
                 command = at_rest()
@@ -59,7 +59,7 @@ class Watchdog:
             self._thread.join()
 
     def _is_late(self) -> bool:
-        """Whether the loop has ever sent no command for too long; it is remembered."""
+        """Return whether the loop has ever sent no command for too long (latched)."""
         if self._armed_at is not None and self._now() - self._armed_at > self._longest:
             self.acted = True
         return self.acted
@@ -70,10 +70,10 @@ class Watchdog:
                 self._look()
 
     def _look(self) -> None:
-        """Disarm the vehicle if the loop is late; again and again once it was."""
+        """Send a disarm frame if the loop is late, or ever was."""
         if not self._is_late():
             return
         try:
             self.error = None if self._link.send(at_rest()) else OSError("the link did not take it")
-        except Exception as error:  # whatever it is, the next one may get through
+        except Exception as error:  # whatever failed, the next frame may get through
             self.error = error

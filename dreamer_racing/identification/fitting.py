@@ -1,9 +1,9 @@
-"""Finds the numbers of a rate loop with which the simulation answers a recording's commands as its vehicle did.
+"""Fits the parameters of a rate loop, so that the simulation responds to a recording's commands as its vehicle did.
 
-The model is the very one that agents train in: flight controller, mixer and motors of `preset=betaflight`, turning a
-rigid body. Many candidates fly all stretches of the recording at once, so that a step of Gauss-Newton is one flight.
+The model is the one that agents train in: flight controller, mixer and motors of `preset=betaflight`, turning a rigid
+body. All candidates fly all stretches of the recording in parallel, so that a Gauss-Newton step is one simulation.
 
-Shapes: C candidates, S stretches, T ms, P parameters; N = C · S drones. SI units, body frame FLU.
+Shapes: C candidates, S stretches (segments), T ms, P parameters; N = C · S drones. SI units, body frame FLU.
 """
 
 from __future__ import annotations
@@ -27,35 +27,35 @@ from dreamer_racing.identification.recorded import AXES, DT, Recorded, stretches
 logger = logging.getLogger(__name__)
 
 STRETCH = 1.1
-"""s that a drone flies without being told where it is [choice]: longer ones stray by what is not modelled."""
+"""s of open-loop simulation, from a measured start [choice]: longer ones stray by what is not modelled."""
 BURN_IN = 0.2
-"""s at its beginning that are not compared [choice]: what filters and integrals were then is not known."""
+"""s at its start that are not compared [choice]: the states of filters and integrators are not known there."""
 EVERY = 5
 """ms between two comparisons."""
 CORRELATED = 0.04
-"""s over which errors are alike [choice]: what is left is not noise, but what the model lacks."""
+"""s over which errors are correlated [choice]: they are not noise, but what the model lacks."""
 FLOOR = 0.003
-"""Of the RMS of rates: the least that errors are taken to be [choice]."""
+"""Least assumed error, as a share of the RMS of rates [choice]."""
 OUTLIER = 3.0
-"""Standard deviations beyond which an error counts by its size, not its square: recordings have pauses and gusts."""
+"""Standard deviations beyond which an error counts linearly, not squared: recordings have pauses and gusts."""
 LEFT_OUT = 0.1
-"""Share of the errors, the largest ones, that do not show in `Fit.errors`: of pauses and gusts."""
+"""Share of the largest errors, due to pauses and gusts, that `Fit.errors` leaves out."""
 STEPS = 15
-"""Of Gauss-Newton, at the most."""
+"""Largest number of Gauss-Newton steps."""
 UNKNOWN = 0.5
-"""Share of what a number was believed to within before, above which a recording has told little of it [choice]."""
+"""Share of the prior's standard deviation above which a fitted parameter counts as unknown [choice]."""
 DONE = 0.02
-"""Largest change of a parameter, relative to how well it was known before, at which it is found."""
+"""Largest change of a parameter, as a share of its prior's standard deviation, at which the fit ends."""
 
 
 class Parameter(NamedTuple):
-    """A number to be found.
+    """A parameter to be fitted.
 
     Args:
-        name: Of it.
-        prior: Standard deviation of what is believed before: of its logarithm, or of a delay in s [choice].
-        probe: By which it is changed to see what that does.
-        axis: On whose steps it depends, of `AXES`; None: on all.
+        name: Its name.
+        prior: Standard deviation of its prior: of its logarithm, or of a delay in s [choice].
+        probe: Finite-difference step.
+        axis: Axis of `AXES` whose steps determine it; None: all.
     """
 
     name: str
@@ -71,22 +71,22 @@ PARAMETERS = (
     Parameter("motor_lag", 0.7, 0.1),
     Parameter("delay", 0.015, 0.003),
 )
-"""Gains relative to those that the fit began with, and the lag, as logarithms; delay in s, added. Cut-offs of filters
-are not among them: D tells the same of them, and a flight controller is asked for them."""
+"""Gains relative to the initial ones, and the lag, as logarithms; delay in s, added. Cut-offs of filters are not
+fitted: their effect is like that of D, and the flight controller's settings give them."""
 
 
 @dataclass(frozen=True)
 class Fit:
-    """What was found.
+    """The result of a fit.
 
     Attributes:
-        parameters: Of the drone that answers as the recorded one did.
-        values: By name: what was found, relative to where the fit began, and in s of the delay.
-        deviations: By name: standard deviation of it, as a share, and in s of the delay; by how stretches differ.
-        unknown: Names of those of which the recording says little: they are as they were.
-        errors: RMS error of body rates relative to the RMS of those asked for, by axis, of all but the `LEFT_OUT` that
-            are farthest off; of the fitted, and ``before``.
-        thrust: Delivered collective thrust, relative to what the model gives; None where no force was measured.
+        parameters: Parameters of the drone that responds as the recorded one did.
+        values: By name: fitted value, relative to the initial one; for the delay, its change in s.
+        deviations: By name: its standard deviation, as a share, or in s for the delay; from differences of stretches.
+        unknown: Names of parameters that the recording hardly determines: they stay near their initial values.
+        errors: By axis: RMS error of body rates relative to the RMS of commanded ones, without the largest `LEFT_OUT`.
+        before: As ``errors``, of the initial parameters.
+        thrust: Measured collective thrust, relative to the model's; None if no force was measured.
     """
 
     parameters: QuadrotorParameters
@@ -99,11 +99,11 @@ class Fit:
 
 
 class Flown(NamedTuple):
-    """Stretches as candidates flew them.
+    """Stretches as simulated with candidates.
 
     Args:
         rates: (T / EVERY, C, S, 3) rad/s.
-        force: (T / EVERY, C, S) of the rotors, per mass, m/s².
+        force: (T / EVERY, C, S) rotor thrust per mass, m/s².
     """
 
     rates: Tensor
@@ -111,13 +111,13 @@ class Flown(NamedTuple):
 
 
 class Model:
-    """Candidates that fly the stretches of a recording.
+    """Simulates the stretches of a recording with candidates.
 
     Args:
         nominal: The drone that candidates are variations of; its `betaflight` is set.
-        recorded: What was flown.
+        recorded: The recording.
         parts: S stretches of T ms.
-        candidates: C at a time.
+        candidates: C, simulated in parallel.
     """
 
     def __init__(
@@ -139,7 +139,7 @@ class Model:
             torch.from_numpy(np.stack([values[part] for part in parts], 1))
             for values in (recorded.command, recorded.fresh, recorded.rates)
         )
-        # what a controller remembers where a stretch begins is what it does in the one before, as last flown
+        # a controller's state at the start of a stretch is that in the stretch before, as last simulated
         begins = np.array([part.start for part in parts])
         self._handover = round((STRETCH - BURN_IN) / DT)
         self._follows = torch.from_numpy(np.diff(begins, prepend=begins[0] - 1) == self._handover)  # (S,)
@@ -148,13 +148,13 @@ class Model:
         self._command, self._fresh, self._rates = command, fresh, rates  # each (T, S, ...)
 
     def _integrate(self) -> None:
-        """Turn the bodies, which stay where they are, as MuJoCo would."""
+        """Integrate the rotation of the bodies, whose positions stay fixed, as MuJoCo would."""
         rates = self._qvel[:, 3:]
         gyroscopic = torch.linalg.cross(rates, self._inertia * rates)
         rates += DT / self._inertia * (self._force[:, 3:] - gyroscopic)
 
     def fly(self, candidates: Tensor) -> Flown:
-        """Fly all stretches with candidates (C, P), from the rates at their beginnings on."""
+        """Simulate all stretches with candidates (C, P), from the measured rates at their starts on."""
         quadrotor, loop, (_, stretches_) = self._quadrotor, self._quadrotor.rate_loop, self._shape
         assert loop is not None
         late = self._give(candidates)  # (C,) ms
@@ -177,7 +177,7 @@ class Model:
         return Flown(torch.stack(rates), torch.stack(force))
 
     def _begin(self, candidates: int) -> None:
-        """Put the drones at the beginnings of their stretches."""
+        """Put the drones at the starts of their stretches."""
         loop = self._quadrotor.rate_loop
         assert loop is not None
         self._qpos[:, 3:] = torch.tensor((1.0, 0.0, 0.0, 0.0), dtype=torch.float64)
@@ -193,14 +193,14 @@ class Model:
                 kept.copy_(torch.where(rows, of_all, kept))
 
     def _remember(self, candidate: int) -> None:
-        """Keep what the drones of a candidate remember, each for the stretch after its own."""
+        """Store controller state and rotor speeds of a candidate's drones, each for the stretch after its own."""
         loop = self._quadrotor.rate_loop
         assert loop is not None
         own = slice(candidate * self._shape[1], (candidate + 1) * self._shape[1])
         self._next = loop.state[own].roll(1, 0).clone(), self._quadrotor.rotor_speed[own].roll(1, 0).clone()
 
     def _give(self, candidates: Tensor) -> Tensor:
-        """Give the drones of candidates (C, P) their numbers; return the delay of each, (C,) ms."""
+        """Set the parameters of the drones of candidates (C, P); return the delay of each, (C,) ms."""
         loop, values = self._quadrotor.rate_loop, by_name(candidates)
         assert loop is not None
         own = torch.ones(len(candidates), len(Own), 3, dtype=torch.float64)
@@ -214,21 +214,21 @@ class Model:
 
 
 def by_name(candidates: Tensor) -> dict[str, Tensor]:
-    """Return the numbers of candidates (C, P), (C,) each."""
+    """Return the parameters of candidates (C, P) by name, (C,) each."""
     return {parameter.name: candidates[:, index] for index, parameter in enumerate(PARAMETERS)}
 
 
 def fit(recorded: Recorded, nominal: QuadrotorParameters) -> Fit:
-    """Find the numbers of a recording's drone.
+    """Fit the parameters of a recording's drone.
 
-    What the recording says nothing of stays near what it was: each number has a width by which it is believed before.
+    Each parameter has a prior, so that one that the recording does not determine stays near its initial value.
 
     Args:
-        recorded: The recording; `Recorded.check` says whether it is one to learn from.
-        nominal: Where to begin, with a flight controller of `betaflight`.
+        recorded: The recording; `Recorded.check` refuses unsuitable ones.
+        nominal: The initial drone, whose `betaflight` is set.
 
     Raises:
-        ValueError: The drone has no such flight controller, or there is no stretch that was measured throughout.
+        ValueError: The drone has no `betaflight`, or there is no stretch that was measured throughout.
     """
     if nominal.betaflight is None:
         raise ValueError("The fit is of a Betaflight's rate loop: begin with preset=betaflight, or a drone made of it.")
@@ -264,11 +264,11 @@ class Step(NamedTuple):
     """A step of the fit.
 
     Args:
-        found: (P,) numbers.
-        errors: Of them, by axis.
-        known: (P,) standard deviations with which they are known.
-        differing: (P,) likewise, by how stretches differ.
-        flown: By them and by what is near them.
+        found: (P,) parameters.
+        errors: Their errors, by axis.
+        known: (P,) their posterior standard deviations.
+        differing: (P,) likewise, from differences of stretches.
+        flown: Simulated with them, and with each one probed.
     """
 
     found: Tensor
@@ -281,17 +281,17 @@ class Step(NamedTuple):
 def _solve(
     error: Tensor, floor: Tensor, probes: Tensor, priors: Tensor, found: Tensor
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Return by how much to change the numbers, how well they are known, and by how much stretches differ, (P,) each.
+    """Return the change of the parameters, and two standard deviations of them, (P,) each.
 
-    The second is the standard deviation of a posterior, the third that of the estimate over stretches (sandwich), which
-    also holds where errors are not independent.
+    The first deviation is that of the posterior, the second that of the estimate over stretches (sandwich), which also
+    holds if errors are not independent.
 
     Args:
-        error: (T, C, S, 3) of the present numbers, and of each with its probe.
-        floor: (3,) rad/s, which errors are taken to be at the least: where a vehicle hovers there is next to none.
-        probes: (P,).
-        priors: (P,) standard deviations of what is believed before.
-        found: (P,) present numbers.
+        error: (T, C, S, 3) of the present parameters, and with each one probed.
+        floor: (3,) rad/s, least assumed error: in a hover, errors are close to zero.
+        probes: (P,) finite-difference steps.
+        priors: (P,) standard deviations of the priors.
+        found: (P,) present parameters.
     """
     present = error[:, 0]  # (T, S, 3)
     slopes = (error[:, 1:] - present.unsqueeze(1)) / probes.view(-1, 1, 1)  # (T, P, S, 3)
@@ -309,7 +309,7 @@ def _solve(
 
 
 def _rms(error: Tensor, recorded: Recorded, parts: Sequence[slice]) -> dict[str, float]:
-    """Return the RMS of errors (T, S, 3), but for the largest, relative to that of the rates asked for, by axis."""
+    """Return the RMS of errors (T, S, 3), without the largest, relative to that of the commanded rates, by axis."""
     asked = np.concatenate([recorded.command[part, 1:] for part in parts])
     squares = error.square().flatten(0, 1).sort(0).values  # (T · S, 3)
     kept = squares[: math.ceil((1.0 - LEFT_OUT) * len(squares))].mean(0).sqrt()
@@ -320,7 +320,7 @@ def _rms(error: Tensor, recorded: Recorded, parts: Sequence[slice]) -> dict[str,
 def _conclude(
     last: Step, before: dict[str, float], nominal: QuadrotorParameters, recorded: Recorded, parts: Sequence[slice]
 ) -> Fit:
-    """Make the drone of the numbers found."""
+    """Return the result of a fit from its last step."""
     unknown = tuple(
         parameter.name
         for parameter, each in zip(PARAMETERS, last.known.tolist(), strict=True)
@@ -335,7 +335,7 @@ def _conclude(
 
 
 def _thrust(force: Tensor, recorded: Recorded, parts: Sequence[slice]) -> float | None:
-    """Return by which factor the measured force exceeds the modelled one (T, S), m/s²."""
+    """Return the ratio of measured to modelled force (T, S), m/s²; None if too little was measured."""
     measured = np.stack([recorded.force[part] for part in parts], 1)
     size = round(BURN_IN / DT / EVERY)
     measured = measured[: EVERY * len(force)].reshape(len(force), EVERY, -1)[size:]
@@ -347,12 +347,12 @@ def _thrust(force: Tensor, recorded: Recorded, parts: Sequence[slice]) -> float 
 
 
 def apply(nominal: QuadrotorParameters, values: dict[str, float], thrust: float = 1.0) -> QuadrotorParameters:
-    """Return a drone with numbers relative to a nominal one's.
+    """Return a drone with parameters relative to those of a nominal one.
 
     Args:
-        nominal: With a flight controller of `betaflight`.
-        values: By the names of `PARAMETERS`; the delay in s, added.
-        thrust: Of its rotors, relative: gains, which command them, are less by as much.
+        nominal: The nominal drone, whose `betaflight` is set.
+        values: Factors, by the names of `PARAMETERS`; the delay in s, added.
+        thrust: Factor of rotor thrust; gains, which command it, are divided by it.
     """
     assert nominal.betaflight is not None, "checked"
     firmware: Any = nominal.betaflight

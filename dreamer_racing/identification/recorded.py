@@ -1,4 +1,4 @@
-"""Recordings of what was asked of a vehicle and what it did, put on a grid of 1 ms.
+"""Recordings of a vehicle's commands and of its response, on a grid of 1 ms.
 
 Shapes: T ms.
 """
@@ -19,20 +19,20 @@ from dreamer_racing.hil.attitude import rotation_matrix
 from dreamer_racing.hil.recording import Flight
 
 DT = 0.001
-"""s, of the grid."""
+"""s, step of the grid."""
 
 AXES = ("roll", "pitch", "yaw", "thrust")
 UNITS = ("rad/s", "rad/s", "rad/s", "m/s²")
 
 FASTEST = 500.0
-"""rad/s² beyond which rates were not flown, but the body was put somewhere else [choice]: small racers reach 440."""
+"""rad/s² beyond which rates have jumped by a reset of the body, not in flight [choice]: small racers reach 440."""
 
 LONGEST_GAP = 0.05
 """s without a measurement over which nothing is interpolated [choice]."""
 
 QUIET = (0.4, 0.4, 0.3, 0.8)
-"""By which commands of each axis must vary at least, as a standard deviation within a window, for that to count as
-moved [choice]: below it noise and what is not modelled are as large as what is to be seen."""
+"""Least standard deviation of each axis's commands within a window for it to count as moved, in `UNITS` [choice]:
+below, noise and model errors are as large as the response."""
 LEAST = (2.0, 2.0, 3.0, 2.0)
 """s for which each axis must be moved [choice]: yaw, which is slow, for longer."""
 WINDOW = 1.0
@@ -44,10 +44,10 @@ class Recorded:
     """A recording of T ms.
 
     Attributes:
-        command: (T, 4) what was asked for: collective thrust, m/s², and body rates, rad/s; held until the next command.
+        command: (T, 4) commanded collective thrust, m/s², and body rates, rad/s; held until the next command.
         fresh: (T,) bool: where a command was sent.
-        rates: (T, 3) body rates that were measured, rad/s; not a number where nothing was.
-        force: (T,) specific force along body z that was measured, m/s²; not a number where nothing was.
+        rates: (T, 3) measured body rates, rad/s; NaN where nothing was measured.
+        force: (T,) measured specific force along body z, m/s²; NaN where nothing was measured.
     """
 
     command: np.ndarray
@@ -67,7 +67,7 @@ class Recorded:
         return tuple(float(WINDOW * count) for count in (deviation > QUIET).sum(0))
 
     def check(self, source: str | Path) -> None:
-        """Refuse what is too short or too quiet to tell anything.
+        """Refuse a recording that is too short or too quiet for a fit.
 
         Raises:
             ValueError: The message says which axis needs what.
@@ -90,7 +90,7 @@ def read_recorded(path: str | Path) -> Recorded:
     """Read a flight of `recipes/hil.py`, or a table (``.csv``, ``.csv.gz``) as `read_table` does.
 
     Raises:
-        FileNotFoundError: There is none.
+        FileNotFoundError: There is no such file.
         ValueError: It is neither, or was never armed.
     """
     path = Path(path)
@@ -100,9 +100,9 @@ def read_recorded(path: str | Path) -> Recorded:
 
 
 def read_table(path: Path) -> Recorded:
-    """Read a table with a row a ms: ``t`` s, ``thrust_cmd`` m/s², ``wx_cmd wy_cmd wz_cmd`` and ``wx wy wz`` rad/s, FLU.
+    """Read a table, a row per ms: ``t`` s, ``thrust_cmd`` m/s², ``wx_cmd wy_cmd wz_cmd`` and ``wx wy wz`` rad/s, FLU.
 
-    Thrust is read off ``az`` (specific force along body z, m/s²) where there is such a column.
+    The force is column ``az`` (specific force along body z, m/s²), if there is one.
     """
     if not path.is_file():
         raise FileNotFoundError(f"There is no recording {path}.")
@@ -121,17 +121,17 @@ def read_table(path: Path) -> Recorded:
 
 
 def of_flight(flight: Flight) -> Recorded:
-    """Put a flight of `recipes/hil.py` on the grid: while it was armed.
+    """Put the armed part of a flight of `recipes/hil.py` on the grid.
 
     Raises:
-        ValueError: It never was.
+        ValueError: It was never armed.
     """
     sent = [(tick["in"]["time"] + tick["took"]["sent"], tick["out"]["command"]) for tick in flight.ticks]
     armed = [(time, command[1:]) for time, command in sent if command[0]]
     if not armed:
         raise ValueError("This flight was never armed: there is nothing to be read off it.")
     poses = np.array([packet for tick in flight.ticks for packet in tick["in"]["received"]], float)
-    poses = poses[np.unique(poses[:, 2], return_index=True)[1]]  # by stamp, each once
+    poses = poses[np.unique(poses[:, 2], return_index=True)[1]]  # sorted by timestamp, without duplicates
     latency = float((flight.about.get("config") or {}).get("latency") or 0.0)
     time = poses[:, 2] + (poses[:, 0] - poses[:, 2]).min() - latency  # s, by the loop's clock
     within = (time >= armed[0][0]) & (time <= armed[-1][0])
@@ -142,7 +142,7 @@ def of_flight(flight: Flight) -> Recorded:
 
 
 def _specific_force(time: np.ndarray, poses: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return specific forces along body z, m/s², between poses, and when that was."""
+    """Return the times between poses, s, and specific forces along body z then, m/s²."""
     velocity, attitude = poses[:, 10:13], poses[:, 6:10]
     step = np.diff(time)
     acceleration = np.diff(velocity, axis=0) / np.maximum(step, 1e-6)[:, None] + (0.0, 0.0, GRAVITY)
@@ -173,7 +173,7 @@ def _on_grid(
 
 
 def _interpolate(grid: np.ndarray, time: np.ndarray, values: np.ndarray) -> np.ndarray:
-    """Return values (T, K) on the grid; not a number in gaps."""
+    """Interpolate values (T, K) to the grid; NaN in gaps."""
     if len(time) < 2:
         return np.full((len(grid), values.shape[1]), np.nan)
     columns = np.column_stack([np.interp(grid, time, column) for column in values.T])
@@ -184,7 +184,7 @@ def _interpolate(grid: np.ndarray, time: np.ndarray, values: np.ndarray) -> np.n
 
 
 def stretches(recorded: Recorded, seconds: float, overlap: float) -> Sequence[slice]:
-    """Return windows of so many s, each so much within the one before, in which all rates were measured throughout."""
+    """Return windows of ``seconds`` s that overlap by ``overlap`` s, in which all rates were measured throughout."""
     size, step = round(seconds / DT), round((seconds - overlap) / DT)
     seen = np.isfinite(recorded.rates).all(1)
     edges = np.flatnonzero(np.diff(np.concatenate(([False], seen, [False]))))

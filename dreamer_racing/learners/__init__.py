@@ -1,4 +1,4 @@
-"""One update each: DreamerV3, and the model-free baselines PPO and SAC on TorchRL's losses."""
+"""Learners: DreamerV3, PPO in world-model latents, and the model-free baselines PPO and SAC on TorchRL's losses."""
 
 import dreamer_racing.envs  # noqa: F401 - heeds MUJOCO_GL before TorchRL imports MuJoCo
 from dreamer_racing.learners.networks import BaselinePolicy, NetworkSize

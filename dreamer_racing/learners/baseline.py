@@ -1,4 +1,4 @@
-"""What the baselines' learners have in common."""
+"""Base class of the model-free learners PPO and SAC."""
 
 from __future__ import annotations
 
@@ -16,19 +16,19 @@ from dreamer_racing.modules import Interface
 
 
 class BaselineLearner(ABC):
-    """Networks, one optimiser, and their state.
+    """Base of learners with an actor, one optimiser and a saved state.
 
     Args:
-        size: Of the networks.
-        interface: What the agent sees and does.
+        size: Size of the networks.
+        interface: Observations and actions of the agent.
         device: Where the networks live and updates run.
 
     Attributes:
-        actor: Whose policy acts.
-        networks: The trained parameters of each network.
-        optimizer: Of all of them.
+        actor: Network of the policy.
+        networks: Trained parameters by the name of their network.
+        optimizer: Optimiser of all networks.
         device: As given.
-        updates: Gradient steps made.
+        updates: Number of gradient steps so far.
     """
 
     actor: ProbabilisticTensorDictSequential
@@ -43,23 +43,23 @@ class BaselineLearner(ABC):
         self._guard = FiniteGuard(lag=2 if self.device.type == "cuda" else 0)
 
     def policy(self, deterministic: bool = False) -> BaselinePolicy:
-        """Return the acting step, which shares this learner's parameters."""
+        """Return the policy that is trained, which shares this learner's parameters."""
         return BaselinePolicy(self.actor, deterministic)
 
     def evaluation_policy(self) -> BaselinePolicy:
-        """Return the acting step to evaluate: the one that is trained."""
+        """Return the policy to evaluate: the one that is trained."""
         return self.policy()
 
     def value_function(self) -> ValueFunction | None:
-        """Return what the critic makes of a state; None of learners without a critic of states."""
+        """Return the critic's value function; None for learners without a critic of states."""
         return None
 
     def check_finite(self) -> None:
-        """Wait for the latest updates; raise ``NonFiniteLossError`` if one of them was not finite."""
+        """Wait for pending updates; raise ``NonFiniteLossError`` if one of them was not finite."""
         self._guard.settle()
 
     def state_dict(self) -> dict[str, Any]:
-        """Return everything that the next update depends on, but for the global random generators."""
+        """Return everything that the next update depends on, except the global random generators."""
         parts = {name: module.state_dict() for name, module in self._modules().items()}
         return {"size": self._size, **parts, "optimizer": self.optimizer.state_dict(), "updates": self.updates}
 
@@ -67,7 +67,7 @@ class BaselineLearner(ABC):
         """Restore what ``state_dict`` returned.
 
         Raises:
-            ValueError: If it is that of networks of another size; nothing is changed then.
+            ValueError: If the networks have another size; nothing is changed then.
         """
         check_layers(state_dict["size"], self._size)
         for name, module in self._modules().items():
@@ -79,7 +79,7 @@ class BaselineLearner(ABC):
 
     @abstractmethod
     def _modules(self) -> dict[str, nn.Module]:
-        """Return what is saved."""
+        """Return the modules to save, by name."""
 
 
 def detached(outputs: dict[str, Tensor]) -> dict[str, Tensor]:

@@ -1,4 +1,4 @@
-"""Numbers of an update with a world model, beside those of the losses."""
+"""Configuration of a world-model learner's update."""
 
 from __future__ import annotations
 
@@ -10,25 +10,25 @@ from dreamer_racing.settings import COUNT, NOT_NEGATIVE, POSITIVE, POSITIVE_SHAR
 
 @dataclass
 class LearnerConfig:
-    """Numbers of an update, beside those of its losses.
+    """Settings of an update, without those of its losses.
 
     Attributes:
-        imagination_horizon: H, imagined actions from each start; also how far ahead the world model is measured.
-        imagination_starts: Imagine from a random subset of so many records of the batch; None from all of them.
-        average_rate: Fraction by which the averaged weights, which fly evaluations and exports, move at each update;
-            None keeps none.
-        slow_critic_rate: Fraction by which the slow critic moves at each update.
-        cuda_graph: On a CUDA device, replay forward and backward as one CUDA graph. None, which the recipes replace by
-            whether the run can, is False.
-        few_kernels: Save kernels: weights are cast once an update instead of at every use (with ``mixed_precision``),
-            gradients of gains and biases are summed after the loop over T, the noise of imagination is drawn ahead of
-            it. That rounds elsewhere and imagines other samples. None: on a CUDA device, where a small kernel's launch
-            takes longer than its work.
-        mixed_precision: Compute the losses under bfloat16 autocast; parameters, logits and losses stay float32. None,
-            which the recipes replace by what the device does well, is False.
-        learning_rate: The reference's 4e-5 suits large models, small ones learn faster at 1e-4 to 3e-4.
-        behavior_learning_rate: Of actor and critic; None for the same. A lower one lets the world model get ahead of
-            the policy that exploits its mistakes; the 2023 code had 1e-4 and 3e-5.
+        imagination_horizon: H, imagined actions from each start; also the horizon at which the world model's
+            predictions are evaluated.
+        imagination_starts: Number of random records of the batch from which imagination starts; None for all of them.
+        average_rate: Rate of the exponential moving average of the weights, which evaluations and exports use; None
+            keeps no average.
+        slow_critic_rate: Fraction by which the slow critic moves towards the critic at each update.
+        cuda_graph: Replay forward and backward pass as one CUDA graph. The recipes replace None by whether the run
+            supports it; otherwise None means False.
+        few_kernels: Launch fewer kernels: cast weights once per update (with ``mixed_precision``), sum the gradients of
+            gains and biases after the loop over T, draw imagination's noise in advance. Rounding and samples differ.
+            None turns it on for CUDA devices, where launching a small kernel takes longer than running it.
+        mixed_precision: Compute the losses under bfloat16 autocast; parameters, logits and losses stay float32. The
+            recipes replace None by whether the device gains by it; otherwise None means False.
+        learning_rate: Learning rate. The reference's 4e-5 suits large models; small ones learn faster at 1e-4 to 3e-4.
+        behavior_learning_rate: Learning rate of actor and critic; None for the same. A lower one gives the world model
+            a lead over a policy that exploits its errors; the 2023 code had 3e-5 beside 1e-4.
         warmup_updates: Updates over which the learning rate rises from zero.
 
     Reference: danijar/dreamerv3, ``configs.yaml``.

@@ -1,4 +1,4 @@
-"""DreamerV3: a world model learns from replayed records, and the policy learns in it, by what it imagines.
+"""DreamerV3: the world model learns from replayed records, and the policy learns from rollouts imagined in it.
 
 Shape legend: B batch, T time, N starts, H horizon, F features, A action. Imagined steps have time first.
 
@@ -39,8 +39,8 @@ class DreamerV3(WorldModelLearner):
 
     Args:
         agent: The networks, on the device where updates run.
-        losses: Numbers of the losses; ``actor`` is the objective.
-        config: Numbers of the update.
+        losses: Settings of the losses; ``actor`` names the objective.
+        config: Settings of the update.
 
     Example:
         >>> learner = DreamerV3.make("debug", seed=0)
@@ -63,11 +63,11 @@ class DreamerV3(WorldModelLearner):
             device
         )
         self.action_change_scale = torch.tensor(float(losses.action_change_scale), device=device)
-        self._actor_learns = torch.ones((), device=device)  # 0 or 1, read by a captured graph too
+        self._actor_learns = torch.ones((), device=device)  # 0 or 1; a tensor, so that a captured CUDA graph reads it
         super().__init__(agent, losses, config)
 
     def update(self, batch: TensorDictBase, timed: Timer = untimed) -> dict[str, Tensor]:
-        """Make one gradient step of all networks; as `WorldModelLearner.update`."""
+        """Make one gradient step for all networks; see `WorldModelLearner.update`."""
         self._actor_learns.fill_(self.updates >= self.loss_config.actor_begin)
         metrics = self.gradient_step(batch, timed)
         self.average_weights()
@@ -83,7 +83,7 @@ class DreamerV3(WorldModelLearner):
         numbers, agent = self.loss_config, self.agent
         model, actor, critic = agent.world_model, agent.actor, agent.critic
 
-        # World model: infer the latents of the records, predict from them rewards, ends and targets (Eq. 4, 5).
+        # World model: infer the records' latents, and predict rewards, episode ends and targets (Eq. 4, 5).
         with timed("world_model"):
             losses, latents = self.world_model_loss(batch)
             losses |= self.drift_losses(latents, batch)
@@ -92,7 +92,7 @@ class DreamerV3(WorldModelLearner):
         self.note_latents(latents)
 
         with timed("imagine"):
-            # Imagination: from latents of the records on, the policy acts H times in the model.
+            # Imagination: starting from latents of the records, the policy acts H times in the world model.
             starts = choose_starts(
                 latents.belief,
                 latents.state,
@@ -103,20 +103,20 @@ class DreamerV3(WorldModelLearner):
             with gradient_of_actions(self.objective, model, critic):
                 imagined, action = imagine(model.rssm, actor, starts.belief, starts.state, self.horizon)
 
-                # What it leads to (H, N, 1): rewards, the chance that the episode goes on, and λ-returns (Eq. 7).
+                # Rewards, probabilities that the episode continues, and λ-returns of the rollout, (H, N, 1) (Eq. 7).
                 value = critic.value(imagined)  # (H + 1, N, 1)
                 reward = model.reward_head.mean(imagined[1:])
                 goes_on = self._continuation(imagined[1:])
                 discount = self.discount * goes_on
                 returns = lambda_return(reward, value[1:], discount, numbers.lambda_)
 
-            # A step counts for the discounted probability of getting there: 0 behind a record that ended an episode.
+            # A step's weight is the discounted probability of reaching it: 0 if the start had ended its episode.
             start = 1.0 - starts.terminated.to(discount.dtype).unsqueeze(0)
             weight = torch.cat((start, discount[:-1].detach())).cumprod(0)
             self.return_range.update(parallel.gathered(returns.detach(), dim=1))
             scale = self.return_range.scale()
 
-            # Actor: the objective on the imagined steps, at features without gradient (Eq. 11).
+            # Actor: the objective on the imagined steps, with detached features (Eq. 11).
             features = imagined[:-1].detach()  # (H, N, F)
             policy = actor(features)
             trajectory = Trajectory(
@@ -136,8 +136,8 @@ class DreamerV3(WorldModelLearner):
             objective = objective + self.action_change_scale * change
             losses |= metrics | {"loss_actor": self._actor_learns * objective, "action_change": change.detach()}
 
-            # Critic: two-hot regression of the λ-returns that were replayed, and of those imagined (Eq. 10). If every
-            # record was a start, its first imagined return is a better value than the critic's.
+            # Critic: two-hot regression on the λ-returns of replayed and of imagined steps (Eq. 10). If every record
+            # was a start, replayed returns bootstrap from its imagined return, which is better than the critic's value.
             shape = batch["terminated"].shape
             bootstrap = returns[0].detach().reshape(shape) if self.config.imagination_starts is None else None
             replayed = latents.features if numbers.replay_value_gradient else latents.features.detach()
@@ -161,12 +161,12 @@ class DreamerV3(WorldModelLearner):
     def adjust(
         self, *, imagination_horizon: float | None = None, action_change_scale: float | None = None, **numbers: Any
     ) -> None:
-        """Change what a run may have on a schedule, from the next update on; as `WorldModelLearner.adjust`.
+        """Set scheduled hyperparameters, from the next update on; see `WorldModelLearner.adjust`.
 
         Args:
-            imagination_horizon: H, rounded; a CUDA graph is captured again where it changes.
-            action_change_scale: Weight of the policy's changes from step to step.
-            numbers: Others.
+            imagination_horizon: H, rounded; if it changes, the CUDA graph is captured again.
+            action_change_scale: Weight of the changes of the policy's mean from step to step.
+            numbers: Arguments of `WorldModelLearner.adjust`.
         """
         super().adjust(**numbers)
         if action_change_scale is not None:
@@ -177,21 +177,21 @@ class DreamerV3(WorldModelLearner):
                 self._graph = self._make_graph()
 
     def _continuation(self, features: Tensor) -> Tensor:
-        """Return the probability ``(..., 1)`` that the episode goes on after features ``(..., F)``."""
+        """Return the probability ``(..., 1)`` that the episode continues after features ``(..., F)``."""
         if not self.loss_config.continuation:
             return features.new_ones((*features.shape[:-1], 1), dtype=torch.float32)
         return self.agent.world_model.continue_head.probability(features)
 
     @property
     def modules(self) -> nn.ModuleDict:
-        """All that a gradient step reads and writes."""
+        """Modules that a gradient step reads and writes."""
         return nn.ModuleDict({**super().modules, "return_range": self.return_range})
 
     def state_dict(self) -> dict[str, Any]:
-        """Return everything that the next update depends on, but for the global random generators."""
+        """Return everything that the next update depends on, except the global random generators."""
         return {**super().state_dict(), "return_range": self.return_range.state_dict()}
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
-        """Restore what ``state_dict`` returned; as `WorldModelLearner.load_state_dict`."""
+        """Restore what ``state_dict`` returned; see `WorldModelLearner.load_state_dict`."""
         super().load_state_dict(state_dict)
         self.return_range.load_state_dict(state_dict["return_range"])

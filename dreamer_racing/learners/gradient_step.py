@@ -1,7 +1,7 @@
-"""What a gradient step needs beside losses: optimiser, gradient norms, a guard against what is not finite, CUDA graphs.
+"""Parts of a gradient step besides losses: optimiser, gradient norms, a guard against non-finite values, CUDA graphs.
 
-An update of a small model is some thousands of kernels, which a GPU finishes sooner than a CPU can launch them; a graph
-launches them all at once.
+An update of a small model is some thousands of kernels, which a GPU runs faster than a CPU can launch them; a CUDA
+graph launches them all at once.
 """
 
 from __future__ import annotations
@@ -16,10 +16,10 @@ from torch import Tensor, nn
 
 
 def make_optimizer(groups: list[dict[str, Any]], warmup_updates: int) -> torch.optim.Optimizer:
-    """Make the 2025 reference's optimiser, LaProp with adaptive gradient clipping.
+    """Make the optimiser of the 2025 reference, LaProp with adaptive gradient clipping.
 
     Args:
-        groups: Parameters with their learning rates: ``[{"params": [...], "lr": ...}, ...]``.
+        groups: Parameter groups with their learning rates: ``[{"params": [...], "lr": ...}, ...]``.
         warmup_updates: Updates over which the rates rise from zero.
     """
     from torchrl.trainers.algorithms import DreamerV3Optimizer
@@ -28,17 +28,17 @@ def make_optimizer(groups: list[dict[str, Any]], warmup_updates: int) -> torch.o
 
 
 def gradient_norms(networks: Mapping[str, list[nn.Parameter]]) -> dict[str, Tensor]:
-    """Return the global norm of each network's gradient, a scalar, as ``gradient_norm/<network>``; none without one.
+    """Return the gradient's global norm of each network that has one, scalars by ``gradient_norm/<network>``.
 
     Args:
-        networks: Parameters of each, by its name.
+        networks: Parameters of each network, by its name.
     """
     gradients = {name: [p.grad for p in parameters if p.grad is not None] for name, parameters in networks.items()}
     return {f"gradient_norm/{name}": nn.utils.get_total_norm(found) for name, found in gradients.items() if found}
 
 
 def restore(optimizer: torch.optim.Optimizer, state: dict[str, Any]) -> None:
-    """Restore an optimiser's state, but not its settings: a run may go on with other rates, or on another device."""
+    """Restore an optimiser's state, but keep its own settings: a run may resume with other rates or another device."""
     names = {"lr", "warmup_steps", "fused"}
     own = [{name: value for name, value in group.items() if name in names} for group in optimizer.param_groups]
     groups = [{**group, **settings} for group, settings in zip(state["param_groups"], own, strict=True)]
@@ -46,10 +46,10 @@ def restore(optimizer: torch.optim.Optimizer, state: dict[str, Any]) -> None:
 
 
 class NonFiniteLossError(RuntimeError):
-    """The loss, its gradient or a reward became infinite or not a number.
+    """Raised if a loss, its gradient or a reward is infinite or not a number.
 
     Attributes:
-        batch: What it was computed of: an update's batch ``[B, T]``, or what the actor's loss keeps for improvements.
+        batch: Data of that update: a replayed batch ``[B, T]``, or the collected steps of an actor's update.
     """
 
     def __init__(self, batch: TensorDictBase, of: str = "") -> None:
@@ -61,7 +61,7 @@ class NonFiniteLossError(RuntimeError):
 
 
 class Flag:
-    """A truth value on its way from the device, so that reading it later waits for nothing that came after it.
+    """A boolean that is copied from the device asynchronously; reading it does not wait for later kernels.
 
     Args:
         value: bool, a scalar.
@@ -75,17 +75,17 @@ class Flag:
             self._arrived.record(torch.cuda.current_stream(value.device))
 
     def __bool__(self) -> bool:
-        """Wait until it is here."""
+        """Wait for the copy, and return the value."""
         if self._arrived is not None:
             self._arrived.synchronize()
         return bool(self._value)
 
 
 class FiniteGuard:
-    """Raises once an update would spoil the networks.
+    """Raises ``NonFiniteLossError`` if the metrics of an update are not finite.
 
     Args:
-        lag: Updates after which one is looked at: 0 at once, which waits for the device.
+        lag: Number of updates by which the check is delayed; 0 checks at once, and waits for the device.
     """
 
     def __init__(self, lag: int) -> None:
@@ -93,14 +93,14 @@ class FiniteGuard:
         self._pending: deque[tuple[Flag, TensorDictBase, str]] = deque()
 
     def check(self, metrics: dict[str, Tensor], batch: TensorDictBase, of: str = "") -> None:
-        """Take note of an update's metrics; raise ``NonFiniteLossError`` if those ``lag`` updates ago were bad.
+        """Queue the metrics of an update; raise ``NonFiniteLossError`` if those of ``lag`` updates ago are not finite.
 
-        The loss alone does not tell: two-hot targets are clamped, so that an infinite reward makes it merely large.
+        The loss alone is no proof: two-hot targets are clamped, so an infinite reward only makes the loss large.
 
         Args:
             metrics: Scalars by name.
-            batch: What they are of.
-            of: Whose loss it is, as the error says it; the update's if empty.
+            batch: Data that they were computed from.
+            of: Words of the error message after "The loss", such as " of the actor's update"; may be empty.
         """
         watched = [
             value
@@ -111,7 +111,7 @@ class FiniteGuard:
         self.settle(self._lag)
 
     def settle(self, lag: int = 0) -> None:
-        """Look at all updates but the latest ``lag``; raise ``NonFiniteLossError`` at the first that was bad."""
+        """Check all pending updates but the latest ``lag``; raise ``NonFiniteLossError`` for the first bad one."""
         while len(self._pending) > lag:
             finite, batch, of = self._pending.popleft()
             if not finite:
@@ -119,22 +119,22 @@ class FiniteGuard:
 
 
 Step = Callable[[TensorDictBase], dict[str, Tensor]]
-"""Computes losses of a batch ``[B, T]`` and their gradients; returns scalars."""
+"""Function that computes the losses of a batch ``[B, T]`` and their gradients, and returns scalars by name."""
 
 
 class GraphedStep:
     """Replays a step as one CUDA graph, captured at the first call.
 
-    The step must not wait for the device, and must find ``.grad`` unset: gradients live in the graph's own memory and
-    are overwritten at every replay, so they must not be set to None between calls.
+    The step must not wait for the device. Gradients live in the graph's memory and are overwritten at every replay:
+    ``.grad`` must be None before the first call, and must not be set to None between calls.
 
     Args:
-        step: What to capture.
-        module: Whose gradients and buffers the step writes; the buffers are put back after the warm-up.
-        warmups: Calls before the capture, in which libraries allocate and choose kernels.
+        step: Function to capture.
+        module: Module whose gradients and buffers the step writes; the buffers are restored after the warm-up.
+        warmups: Calls before the capture, in which libraries allocate memory and choose kernels.
 
     Raises:
-        ValueError: At a call with a batch of other shapes than the first.
+        ValueError: At a call, if the shape of the batch is not that of the first.
     """
 
     def __init__(self, step: Step, module: nn.Module, warmups: int = 3) -> None:
@@ -144,7 +144,7 @@ class GraphedStep:
         self._graph: torch.cuda.CUDAGraph | None = None
 
     def __call__(self, batch: TensorDictBase) -> dict[str, Tensor]:
-        """Run the step on a batch ``[B, T]`` on the CUDA device; return copies of its scalars."""
+        """Run the step on a batch ``[B, T]`` on the CUDA device; return copies of the scalars."""
         with torch.cuda.device(batch.device):  # streams and graphs belong to the current device
             return self._replay(batch)
 
@@ -164,7 +164,7 @@ class GraphedStep:
         buffers = {name: buffer.clone() for name, buffer in self._module.named_buffers()}
         side = torch.cuda.Stream()
         side.wait_stream(torch.cuda.current_stream())
-        # The warm-up leaves neither random numbers nor buffers changed: a resumed run makes it again.
+        # The warm-up must change neither random generators nor buffers, because a resumed run repeats it.
         with torch.random.fork_rng(devices=[batch.device]), torch.cuda.stream(side):
             for _ in range(self._warmups):
                 self._module.zero_grad(set_to_none=True)
@@ -174,7 +174,7 @@ class GraphedStep:
             buffer.copy_(buffers[name])
         self._module.zero_grad(set_to_none=True)
         graph = torch.cuda.CUDAGraph()
-        # Threads that prefetch samples may use the device meanwhile.
+        # Thread-local, because threads that prefetch samples may use the device meanwhile.
         with torch.cuda.graph(graph, stream=side, capture_error_mode="thread_local"):
             metrics = self._step(self._batch)
         self._names, self._scalars = list(metrics), [value.detach() for value in metrics.values()]

@@ -1,17 +1,16 @@
-"""Recurrent PPO in a world model's latents: the world model sees and remembers, the policy learns from real rewards.
+"""Recurrent PPO in a world model's latents: the world model is the memory, the policy learns from real rewards.
 
-The world model learns from replayed records. The policy, whose observations are its latents, learns by PPO from
-collected rollouts, once there are enough of them; so does a critic of its own, of the latents or of the simulator's
-state. Nothing is imagined: an actor that learns in imagination ends up where the model is wrong, and the time goes to
-the world model. The agent's critic learns from replayed returns alone, which shape the latents, too.
+The world model learns from replayed records. The policy observes its latents, and learns by PPO from collected rollouts
+once there are enough of them. So does a separate critic, of the latents or of the simulator's state. Nothing is
+imagined: an actor that learns in imagination exploits the errors of the model, and the time is better spent on the
+world model. The agent's own critic learns from replayed returns only; its loss also shapes the latents.
 
 Shape legend: B batch, T time, S steps kept of each of N environments, F features, A action, M records of a minibatch.
 
-Nothing in PPO's update waits for a CUDA device. Whether a gradient step is to be made is known there alone: it is made
-with a mask that may leave everything as it was, and after too large a divergence the remaining steps of an update are
-such.
+PPO's update never waits for a CUDA device. Only the device knows whether a gradient step is to be applied, so every
+step runs with a mask that may make it a no-op; after too large a KL divergence the mask disables the remaining steps.
 
-Reference: Schulman et al. 2017, "Proximal policy optimization algorithms"; of the critic of the state Pinto et al.
+Reference: Schulman et al. 2017, "Proximal policy optimization algorithms"; for the critic of the state, Pinto et al.
 2018, "Asymmetric actor critic for image-based robot learning".
 """
 
@@ -47,33 +46,33 @@ from dreamer_racing.modules.rssm import join_features
 from dreamer_racing.settings import suggestion
 
 CRITICS = ("latent", "state")
-"""What the critic that teaches the actor may see."""
+"""Inputs that PPO's critic may have."""
 CRITIC_LAYERS, CRITIC_UNITS = 3, 256
-"""Hidden layers of that critic [choice]."""
+"""Number and width of the hidden layers of PPO's critic [choice]."""
 RATE_CHANGE, SMALLEST_SCALE = 1.25, 0.01
-"""Factor by which the learning rate then changes, and its smallest share [choice]."""
+"""Factor by which the KL control changes the learning-rate scale, and the smallest scale [choice]."""
 
 MinibatchLoss = Callable[[Tensor], tuple[Tensor, dict[str, Tensor]]]
-"""Loss of the records ``(M,)`` at some places, a scalar, and metrics: of a policy ``ppo/kl`` from the one before."""
+"""Function of record indices ``(M,)`` that returns a scalar loss and metrics; a policy's include ``ppo/kl``."""
 
 
 class LatentPPO(WorldModelLearner):
-    """Trains the world model in each update, and the actor with its critic whenever enough was collected.
+    """Trains the world model in each update, and actor and critic by PPO whenever the rollout storage is full.
 
     `compute_losses` and `update_actor` are the algorithm.
 
     Args:
         agent: The networks, on the device where updates run.
-        losses: Numbers of the losses; ``actor`` is the objective, ``critic`` what its critic sees.
-        config: Numbers of the update.
+        losses: Settings of the losses; ``actor`` names the objective, ``critic`` the input of PPO's critic.
+        config: Settings of the update.
 
     Attributes:
-        critic: The one that teaches the actor.
+        critic: PPO's critic, from which the advantages are computed; not the agent's critic.
         storage: Collected steps.
-        actor_waits: Whether the actor stands still; settable.
+        actor_waits: Whether updates of actor and PPO's critic are suspended; settable.
 
     Raises:
-        ValueError: If the critic is to see the simulator's state, which the environment does not give.
+        ValueError: If the critic needs the simulator's state, and the environment does not give it.
 
     Example:
         >>> learner = LatentPPO.make("debug", seed=0)
@@ -98,7 +97,7 @@ class LatentPPO(WorldModelLearner):
         self.actor_waits = False
 
     def make_networks(self) -> dict[str, nn.Module]:
-        """Make the critic that teaches the actor."""
+        """Make PPO's critic."""
         sees, interface, size = self.loss_config.critic, self.agent.interface, self.size
         if sees not in CRITICS:
             raise ValueError(f"Unknown critic {sees!r}{suggestion(sees, CRITICS)}. There are {', '.join(CRITICS)}.")
@@ -112,16 +111,16 @@ class LatentPPO(WorldModelLearner):
         return {f"{sees}_critic": self.critic}
 
     def collect(self, rollout: TensorDictBase) -> None:
-        """Keep a collector's rollout ``[N, T]``, of `policy`, perhaps with older weights."""
+        """Store a collector's rollout ``[N, T]``, flown by `policy`, perhaps with older weights."""
         self.storage.extend(rollout)
 
     def update(self, batch: TensorDictBase, timed: Timer = untimed) -> dict[str, Tensor]:
-        """Make one gradient step of the world model, and update the actor if enough was collected.
+        """Make one gradient step of the world model, and update the actor if the rollout storage is full.
 
-        As `WorldModelLearner.update`; with ``ppo/loss``, ``ppo/kl``, ``ppo/clipped`` (share of steps), ``ppo/epochs``,
-        ``ppo/learning_rate_scale``, ``ppo/critic_loss``, ``ppo/explained_variance`` (of the returns, by the values
-        before), ``entropy`` (of the policy that acted, nats) and the norms of both gradients where the actor was
-        updated. An error says if it is the actor's update that was not finite.
+        See `WorldModelLearner.update`. If the actor was updated, the metrics also have ``ppo/loss``, ``ppo/kl``,
+        ``ppo/clipped`` (share of steps), ``ppo/epochs``, ``ppo/learning_rate_scale``, ``ppo/critic_loss``,
+        ``ppo/explained_variance`` (of the returns, by the values before the update), ``entropy`` (of the policy that
+        acted, nats) and both gradient norms. ``NonFiniteLossError`` says if it was raised by the actor's update.
         """
         metrics = self.gradient_step(batch, timed)
         if self.storage.full and not self.actor_waits:
@@ -130,27 +129,27 @@ class LatentPPO(WorldModelLearner):
             assert self.storage.steps is not None
             kept = self.storage.steps.flatten()
             if self.device.type == "cuda":
-                kept = kept.clone()  # the guard looks two entries later, and rollouts are written there meanwhile
+                kept = kept.clone()  # the guard reads it two checks later; new rollouts overwrite the storage
             self._guard.check(updated, kept, of=" of the actor's update")
             metrics |= updated
         self.average_weights()
         return metrics
 
     def compute_losses(self, batch: TensorDictBase, timed: Timer = untimed) -> dict[str, Tensor]:
-        """Return the losses of the world model, and of the agent's critic, which shapes latents; and metrics.
+        """Return the losses of the world model and of the agent's critic, which carry gradient, and metrics.
 
         Args:
             batch: Replayed records ``[B, T]``.
             timed: Context manager by activity.
         """
         numbers = self.loss_config
-        # World model: infer the latents of the records, predict from them rewards, ends and targets; leave the policy
-        # where it was.
+        # World model: infer the records' latents, predict rewards, episode ends and targets, and penalise changes of
+        # the policy by changed latents.
         with timed("world_model"):
             losses, latents = self.world_model_loss(batch)
             losses |= self.drift_losses(latents, batch)
         self.note_latents(latents)
-        # What is worth much is seen well: the regression of replayed λ-returns trains the world model, too.
+        # Agent's critic: its regression on replayed λ-returns also trains the latents to tell what returns depend on.
         with timed("imagine"):
             features = latents.features if numbers.replay_value_gradient else latents.features.detach()
             losses["loss_replay_critic"] = numbers.replay_value_scale * replay_critic_loss(
@@ -159,13 +158,13 @@ class LatentPPO(WorldModelLearner):
         return losses
 
     def update_actor(self) -> dict[str, Tensor]:
-        """Update critic and actor on all collected steps, which begin anew; return metrics, scalars."""
+        """Update critic and actor on all collected steps, and empty the storage; return metrics, scalars."""
         numbers, ppo, steps = self.loss_config, self.loss_config.ppo, self.storage.steps
         assert steps is not None, "called when the storage is full"
         self.storage.clear()
-        # The policy acted in float32: at small deviations the rounding of bfloat16 would be a divergence of its own.
+        # In float32, as the policy acted: at small standard deviations bfloat16's rounding would add to the divergence.
         with torch.autocast(self.device.type, enabled=False):
-            # λ-returns of what was paid (S, N, 1), by what the critic expected before.
+            # λ-returns (S, N, 1) of the collected rewards, with the critic's values before this update.
             seen = steps["privileged"] if numbers.critic == "state" else steps["features"]
             with torch.no_grad():
                 value = self.critic.mean(seen)
@@ -176,16 +175,16 @@ class LatentPPO(WorldModelLearner):
             behavior = ActionDistribution(*taken["behavior"].chunk(2, -1))
             inputs, targets = seen.flatten(0, 1), returns.flatten(0, 1)
 
-            # Critic: epochs of two-hot regression of the returns.
+            # Critic: epochs of two-hot regression on the returns.
             def critic_loss(chosen: Tensor) -> tuple[Tensor, dict[str, Tensor]]:
                 log_probabilities = self.critic(inputs[chosen]).log_softmax(-1)
                 return self.critic.two_hot.cross_entropy(log_probabilities, targets[chosen]).mean(), {}
 
             learned = self.critic_update.run(len(taken), critic_loss)
 
-            # Actor: epochs of the objective, until the policy has moved too far from the one before the update. Not
-            # from the one that acted: a bound of the deviation that has come down since would count as if the steps
-            # had done it, and end them.
+            # Actor: epochs of the objective, until the divergence from the policy before this update is too large. It
+            # is not measured from the policy that acted, because a bound on the standard deviation that was lowered
+            # since then would count as divergence and end the epochs.
             weight = torch.ones_like(targets)
             advantage = normalized(targets - value.flatten(0, 1), weight).clamp(-ppo.advantage_clip, ppo.advantage_clip)
             with torch.no_grad():
@@ -208,7 +207,7 @@ class LatentPPO(WorldModelLearner):
                 loss, metrics = self.objective(
                     trajectory, entropy_scale=self.entropy_scale, clip_epsilon=ppo.clip_epsilon
                 )
-                with torch.no_grad():  # over all processes: it ends the epochs of all
+                with torch.no_grad():  # over all processes, which must end their epochs together
                     diverged = ActionDistribution(*before[chosen].chunk(2, -1)).divergence(policy)
                     number = parallel.total(trajectory.weight.sum()).clamp_min(1e-8)
                     kl = parallel.total((trajectory.weight * diverged).sum()) / number
@@ -225,24 +224,24 @@ class LatentPPO(WorldModelLearner):
         }
 
     def value_function(self) -> ValueFunction:
-        """Return what the critic that teaches the actor makes of a state."""
+        """Return the value function of PPO's critic."""
         return self._value_of_step
 
     @torch.no_grad()
     def _value_of_step(self, acted: TensorDictBase) -> Tensor:
-        """Return the value ``(N, 1)`` of records ``[N]`` that `DreamerPolicy` has acted on."""
+        """Return the values ``(N, 1)`` of records ``[N]`` that `DreamerPolicy` has acted on."""
         if self.loss_config.critic == "state":
             seen = symlog(acted[PRIVILEGED])
-        else:  # latents that have seen the observation are under "next"
+        else:  # the latents after the observation are under "next"
             seen = join_features(acted["next", "belief"], acted["next", "state"])
         return self.critic.mean(seen.to(self.device))
 
     def adjust(self, *, kl_target: float | None = None, **numbers: Any) -> None:
-        """Change what a run may have on a schedule, from the next update on; as `WorldModelLearner.adjust`.
+        """Set scheduled hyperparameters, from the next update on; see `WorldModelLearner.adjust`.
 
         Args:
-            kl_target: Of `PPOUpdateConfig`.
-            numbers: Others; ``rates`` is also of the actor's update and of its critic's.
+            kl_target: See `PPOUpdateConfig`.
+            numbers: Arguments of `WorldModelLearner.adjust`; ``rates`` also scales PPO's learning rates.
         """
         super().adjust(**numbers)
         ppo = self.loss_config.ppo
@@ -253,7 +252,7 @@ class LatentPPO(WorldModelLearner):
             self.actor_update.kl_target = kl_target
 
     def state_dict(self) -> dict[str, Any]:
-        """Return everything that the next update depends on, but for the global random generators."""
+        """Return everything that the next update depends on, except the global random generators."""
         return {
             **super().state_dict(),
             "actor_update": self.actor_update.state_dict(),
@@ -262,29 +261,29 @@ class LatentPPO(WorldModelLearner):
         }
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
-        """Restore what ``state_dict`` returned; as `WorldModelLearner.load_state_dict`."""
+        """Restore what ``state_dict`` returned; see `WorldModelLearner.load_state_dict`."""
         super().load_state_dict(state_dict)
         for name in ("actor_update", "critic_update", "storage"):
             getattr(self, name).load_state_dict(state_dict[name])
 
 
 def masks_steps(device: torch.device) -> bool:
-    """Tell whether steps are masked on a device, rather than left out, for which the CPU would have to wait."""
+    """Return whether disabled steps are masked on a device; to skip them, the CPU would have to wait for the device."""
     return device.type == "cuda"
 
 
 class PPOUpdate:
-    """Trains one network on collected steps, with an optimiser of its own.
+    """Trains one network on collected steps, with its own optimiser.
 
     Args:
-        network: Of the actor, or of a critic.
-        learning_rate: Of Adam; the largest, where there is a ``kl_target``.
+        network: Actor or critic.
+        learning_rate: Learning rate of Adam; with a ``kl_target``, its maximum.
         config: Epochs, minibatches, clipping and the divergence that ends an update.
-        kl_target: Divergence before an update's last gradient step, nats, to which the learning rate is steered; None:
-            it stays. May be set between updates.
+        kl_target: Target of the KL divergence before an update's last gradient step, nats, towards which the learning
+            rate is adapted; None keeps the rate constant. May be set between updates.
 
     Attributes:
-        learning_rate_scale: Share of the learning rate that the next update is made at, ``(1,)``.
+        learning_rate_scale: Factor on the learning rate in the next update, ``(1,)``.
     """
 
     def __init__(
@@ -296,24 +295,24 @@ class PPOUpdate:
         self.device = next(network.parameters()).device
         self.learning_rate_scale = torch.ones(1, device=self.device)
         self._masked = masks_steps(self.device)
-        # The fused one takes a mask, and a rate that is a tensor.
+        # Only fused Adam accepts a mask and a learning rate that is a tensor.
         self.optimizer = torch.optim.Adam(
             network.parameters(), lr=learning_rate, eps=1e-5, fused=True if self._masked else None
         )
 
     def run(self, number: int, loss: MinibatchLoss) -> dict[str, Tensor]:
-        """Make the epochs of gradient steps, until one comes upon too large a divergence.
+        """Make epochs of gradient steps; stop early if the KL divergence exceeds ``kl_stop``.
 
-        A step whose gradient is not finite is not made.
+        Steps with a non-finite gradient are skipped.
 
         Args:
-            number: Of records to learn from.
-            loss: Of minibatches of them.
+            number: Number of records to learn from.
+            loss: Loss of a minibatch.
 
         Returns:
-            Means over the gradient steps of what ``loss`` writes, ``loss``, and the gradient's norm before clipping,
-            ``gradient_norm``; where it writes ``ppo/kl``, that before the last step, ``ppo/epochs`` and
-            ``ppo/learning_rate_scale`` that this update was made at. Scalars.
+            Scalars, averaged over the gradient steps: ``loss``, ``gradient_norm`` before clipping, and the metrics of
+            ``loss``. If these have ``ppo/kl``: its value before the last step, ``ppo/epochs``, and this update's
+            ``ppo/learning_rate_scale``.
         """
         if self.kl_target is None:
             self.learning_rate_scale.fill_(1.0)
@@ -330,11 +329,11 @@ class PPOUpdate:
         return metrics
 
     def state_dict(self) -> dict[str, Any]:
-        """Return the optimiser's state, and the share of the learning rate."""
+        """Return the states of the optimiser and of the learning-rate scale."""
         return {"optimizer": self.optimizer.state_dict(), "learning_rate_scale": self.learning_rate_scale.clone()}
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
-        """Restore what ``state_dict`` returned; learning rates are settings, and stay."""
+        """Restore what ``state_dict`` returned; learning rates are settings and stay as they are."""
         restore(self.optimizer, state_dict["optimizer"])
         self.learning_rate_scale.copy_(state_dict["learning_rate_scale"])
 
@@ -343,7 +342,7 @@ class PPOUpdate:
         active = torch.ones((), dtype=torch.bool, device=self.device)
         done, applied = list[dict[str, Tensor]](), list[Tensor]()
         for _ in range(self.config.epochs):
-            # Minibatches differ in size by one at most.
+            # The sizes of minibatches differ by at most one.
             for chosen in torch.randperm(number, device=self.device).tensor_split(minibatches):
                 metrics = self._step(*loss(chosen), active)
                 done.append(metrics)
@@ -356,7 +355,7 @@ class PPOUpdate:
         return _summary(done, applied, minibatches)
 
     def _step(self, loss: Tensor, metrics: dict[str, Tensor], active: Tensor) -> dict[str, Tensor]:
-        """Make one gradient step if ``active``, bool, a scalar, unless its gradient is not finite."""
+        """Make one gradient step if ``active`` (a bool scalar) and if the gradient is finite."""
         self.optimizer.zero_grad(set_to_none=True)
         loss.backward()
         if parallel.count() > 1:
@@ -372,20 +371,20 @@ class PPOUpdate:
         return {"loss": loss.detach(), **metrics, "gradient_norm": norm}
 
     def _control(self, kl: Tensor) -> None:
-        """Lower the learning rate after a divergence well above the target; raise it, up to the full one, well below.
+        """Lower the learning rate if the divergence is well above its target; raise it, at most to 1, if well below.
 
-        Reference: Schulman et al. 2017, Section 4, who steer the weight of a KL penalty so.
+        Reference: Schulman et al. 2017, Section 4, who adapt the weight of a KL penalty this way.
         """
         target, scale = self.kl_target, self.learning_rate_scale
         if target is None:
             return
         lower, higher = (scale / RATE_CHANGE).clamp(min=SMALLEST_SCALE), (scale * RATE_CHANGE).clamp(max=1.0)
         changed = torch.where(kl < target / KL_TOLERANCE, higher, scale)
-        scale.copy_(torch.where(kl <= KL_TOLERANCE * target, changed, lower))  # the latter also where it is no number
+        scale.copy_(torch.where(kl <= KL_TOLERANCE * target, changed, lower))  # lower also if kl is NaN
 
 
 def _summary(done: list[dict[str, Tensor]], applied: list[Tensor], minibatches: int) -> dict[str, Tensor]:
-    """Average over the gradient steps that were ``applied``, bool, scalars; the divergence is that of the last one."""
+    """Average metrics over the gradient steps that were ``applied`` (bool scalars); ``ppo/kl`` is the last one's."""
     mask = torch.stack(applied)
     number = mask.sum()
     values = {name: torch.stack([metrics[name] for metrics in done]) for name in done[0]}

@@ -1,7 +1,7 @@
-"""What code asks of a device, seen from torch's dispatcher: kernels, waits, and tensors of several devices.
+"""Counter of the kernels, synchronisations and device mismatches that code would cause on a CUDA device.
 
-A CPU stands in for a GPU: its operations are the same, though here nothing is launched and nobody waits. What an
-operation would do on a CUDA device is told by its name and its arguments.
+It intercepts torch's dispatcher, and runs on a CPU: the operations are the same, and the name and arguments of each
+tell what it would do on a CUDA device.
 """
 
 from __future__ import annotations
@@ -21,17 +21,17 @@ VIEWS = frozenset((
     "lift_fresh", "permute", "real", "reshape", "select", "slice", "split", "split_with_sizes", "squeeze", "t",
     "transpose", "unbind", "unfold", "unsafe_split", "unsqueeze", "view", "view_as",
 ))  # fmt: skip
-"""Operations that only describe memory anew."""
+"""Operations that only make views of memory."""
 ALLOCATIONS = frozenset((
     "_record_function_enter_new", "_record_function_exit", "empty", "empty_like", "empty_permuted",
     "empty_strided", "new_empty", "new_empty_strided", "record_stream", "resize_", "set_",
 ))  # fmt: skip
-"""Operations that only take memory, or say who uses it or what goes on."""
+"""Operations that only allocate memory, record its use, or mark a profiler's range."""
 WAITS = frozenset((
     "_local_scalar_dense", "_unique2", "bincount", "equal", "is_nonzero", "item", "masked_select", "nonzero",
     "unique_consecutive", "unique_dim",
 ))  # fmt: skip
-"""Operations whose result, or its size, the CPU has to know."""
+"""Operations that make the CPU wait for a result or its size."""
 INDEXED = frozenset((
     "_index_put_impl_", "_unsafe_index", "_unsafe_index_put", "index", "index_put", "index_put_",
 ))  # fmt: skip
@@ -39,15 +39,15 @@ COPIES = frozenset(("_to_copy", "copy_"))
 
 
 class Launches(TorchDispatchMode):
-    """Counts the operations that launch kernels while it is on, and notes those that a CUDA device would not like.
+    """Context that counts operations that launch kernels, and lists those that would stall or fail on CUDA.
 
-    A fused or ``foreach`` operation counts once however many tensors it takes; a matrix product or a reduction, for
-    which a library may launch two kernels, counts once too.
+    A fused or ``foreach`` operation counts once for any number of tensors; so does a matrix product or a reduction, for
+    which a library may launch two kernels.
 
     Attributes:
-        kernels: Operations by name.
-        waits: Where the CPU would wait for the device, as ``operation at file:line``.
-        mixed: Where an operation has tensors of several devices, or copies from one to another; likewise.
+        kernels: Number of operations by name.
+        waits: Places where the CPU would wait for the device, as ``operation at file:line``.
+        mixed: Places where an operation has tensors on several devices, or copies between devices; likewise.
 
     Example:
         >>> with Launches() as seen:
@@ -65,13 +65,13 @@ class Launches(TorchDispatchMode):
 
     @property
     def count(self) -> int:
-        """Of all kernels."""
+        """Total number of kernels."""
         return self.kernels.total()
 
     def __torch_dispatch__(
         self, func: Any, types: Sequence[type], args: tuple = (), kwargs: Mapping[str, Any] | None = None
     ) -> Any:
-        """Look at one operation, and make it."""
+        """Record one operation, and run it."""
         kwargs = kwargs or {}
         name = func._schema.name.partition("::")[2]
         tensors = [value for value in tree_leaves((args, kwargs)) if isinstance(value, Tensor)]
@@ -86,20 +86,20 @@ class Launches(TorchDispatchMode):
 
 
 def _indexes_by_mask(name: str, args: tuple) -> bool:
-    """Tell whether an operation chooses by a mask, whose number of elements the CPU has to know."""
+    """Return whether an operation indexes by a mask, so that the CPU has to wait for the number of elements."""
     return name in INDEXED and any(
         isinstance(index, Tensor) and index.dtype in (torch.bool, torch.uint8) for index in tree_leaves(args[1])
     )
 
 
 def _devices(tensors: Sequence[Tensor], result: Any) -> set[str]:
-    """Return the kinds of device of some tensors; a number that is a tensor goes with any of them."""
+    """Return the device types of tensors; scalars on the CPU, which fit any device, are ignored."""
     results = [value for value in tree_leaves(result) if isinstance(value, Tensor)]
     return {value.device.type for value in (*tensors, *results) if value.ndim or value.device.type != "cpu"}
 
 
 def _place(name: str) -> str:
-    """Say which line of the project, or of the code nearest to it, asked for an operation."""
+    """Return an operation and the innermost line outside of torch and tensordict that called it."""
     stack = [frame for frame in traceback.extract_stack()[:-2] if not _is_machinery(frame.filename)]
     frame = stack[-1]
     return f"{name} at {'/'.join(frame.filename.split('/')[-2:])}:{frame.lineno}"
@@ -110,7 +110,7 @@ def _is_machinery(filename: str) -> bool:
 
 
 def launches(function: Callable[[], Any]) -> Launches:
-    """Call a function; return what it asked for."""
+    """Call a function, and return the record of its operations."""
     with Launches() as seen:
         function()
     return seen

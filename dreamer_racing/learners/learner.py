@@ -1,4 +1,4 @@
-"""What every learner offers, and every policy that is flown."""
+"""Protocols of learners and policies."""
 
 from __future__ import annotations
 
@@ -12,57 +12,57 @@ from torch import Tensor
 from torchrl.envs.transforms import Transform
 
 Timer = Callable[[str], AbstractContextManager]
-"""Context manager by the name of an activity, as ``RunClock.timed``."""
+"""Function from the name of an activity to a context manager that times it, such as ``RunClock.timed``."""
 
 
 ValueFunction = Callable[[TensorDictBase], Tensor]
-"""What a critic expects: of records [N] that the evaluation's policy has acted on, the return from there, (N, 1)."""
+"""Function from records [N] that the evaluation policy has acted on to the critic's expected returns, (N, 1)."""
 
 
 class Policy(Protocol):
-    """The acting step: a module on tensordicts of batch size [N] that writes ``action``, as `BaselinePolicy` is."""
+    """Policy: a module on tensordicts of batch size [N] that writes ``action``, such as `BaselinePolicy`."""
 
     deterministic: bool
-    """Whether it takes modes instead of samples; may be set at any time, and evaluations do."""
+    """Whether it acts without sampling; may be set at any time, and evaluations set it."""
 
     def __call__(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Write the action, and what the policy remembers."""
+        """Write the action and the policy's recurrent state."""
         ...
 
     def make_primer(self) -> Transform:
-        """Make the transform that adds what the policy remembers to an environment; an empty ``Compose`` if nothing."""
+        """Make the transform that adds the policy's recurrent state to an environment; an empty ``Compose`` if none."""
         ...
 
 
 class Evaluable(Protocol):
-    """What can be evaluated: every learner, and a `ShippedAgent`.
+    """Protocol of what can be evaluated: every learner, and a `ShippedAgent`.
 
     Attributes:
-        device: Where it acts, and learns if it does.
+        device: Where its networks are.
     """
 
     device: torch.device
 
     def evaluation_policy(self) -> Policy:
-        """Return the acting step to evaluate, which may be one of averaged weights."""
+        """Return the policy to evaluate, which may have averaged weights."""
         ...
 
     def value_function(self) -> ValueFunction | None:
-        """Return what the critic that teaches the actor makes of a state; None without one."""
+        """Return the value function of the critic that the actor learns from; None without one."""
         ...
 
 
 class Learner(Evaluable, Protocol):
-    """What every learner offers to recipes and evaluations: `DreamerV3`, `LatentPPO`, `PPOLearner` and `SACLearner` do.
+    """Protocol of learners: `DreamerV3`, `LatentPPO`, `PPOLearner` and `SACLearner`.
 
     Attributes:
-        updates: Those made so far.
+        updates: Number of updates so far.
     """
 
     updates: int
 
     def policy(self) -> Policy:
-        """Return the acting step that is trained, which shares the learner's parameters."""
+        """Return the policy that is trained, which shares the learner's parameters."""
         ...
 
     def update(self, batch: TensorDictBase, /, timed: Timer = ...) -> dict[str, Tensor]:
@@ -74,7 +74,7 @@ class Learner(Evaluable, Protocol):
         ...
 
     def state_dict(self) -> dict[str, Any]:
-        """Return everything that the next update depends on, but for the global random generators."""
+        """Return everything that the next update depends on, except the global random generators."""
         ...
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
@@ -83,14 +83,14 @@ class Learner(Evaluable, Protocol):
 
 
 def untimed(activity: str) -> AbstractContextManager:
-    """Measure nothing."""
+    """Return a context that measures nothing, the default ``Timer``."""
     return nullcontext()
 
 
 @contextmanager
 def seeded(seed: int | None) -> Iterator[None]:
-    """Draw initial weights by a seed, without a trace in the global generator; None draws them from that."""
+    """Seed the CPU's random generator, and restore its state afterwards; None leaves the generator alone."""
     with torch.random.fork_rng(devices=[], enabled=seed is not None):
         if seed is not None:
-            torch.default_generator.manual_seed(seed)  # of weights drawn on the CPU; CUDA's generators stay as they are
+            torch.default_generator.manual_seed(seed)  # initial weights are drawn on the CPU; not CUDA's generators
         yield

@@ -31,24 +31,24 @@ from dreamer_racing.settings import COUNT, NOT_NEGATIVE, POSITIVE, SHARE, settin
 
 @dataclass
 class PPOConfig:
-    """Numbers of the learner.
+    """Settings of the PPO learner.
 
     Attributes:
-        learning_rate: Of Adam.
-        epochs: Times that every record of a rollout is trained on.
-        minibatches: Gradient steps of an epoch.
+        learning_rate: Learning rate of Adam.
+        epochs: Number of passes over each rollout.
+        minibatches: Gradient steps per epoch.
         clip_epsilon: ε of the clipped ratio.
         discount: γ.
         lambda_: λ of the advantages.
         entropy_scale: Weight of the policy's entropy.
         critic_scale: Weight of the critic's squared error.
-        reward_scale: Factor on rewards before the critic sees them, so that its errors are of order one.
-        gradient_clip: Largest norm of a network's gradient; actor and critic are clipped apart.
-        initial_std: Of the actions, which later is learned, one number for each dimension.
+        reward_scale: Factor on the rewards that the critic learns from, so that its errors are of order one.
+        gradient_clip: Maximum norm of a network's gradient; actor and critic are clipped separately.
+        initial_std: Initial standard deviation of the actions; one learned number for each dimension.
 
     Reference: Schulman et al. 2017, "Proximal policy optimization algorithms". Clipping, discount, λ and the weights of
     the losses are the defaults of Stable-Baselines3; learning rate, epochs, minibatches, scale of rewards and initial
-    deviation are [choice].
+    standard deviation are [choice].
     """
 
     learning_rate: float = setting(1e-3, POSITIVE)
@@ -67,14 +67,14 @@ class PPOConfig:
 class PPOLearner(BaselineLearner):
     """Actor and critic with TorchRL's ``ClipPPOLoss``, and one optimiser.
 
-    Actions are drawn from a normal that is not bounded: the environment clips them to [−1, 1].
+    Actions are sampled from an unbounded normal distribution; the environment clips them to [−1, 1].
 
     Args:
-        size: Of both networks.
-        interface: What the agent sees and does.
-        config: Numbers of the learner.
+        size: Size of both networks.
+        interface: Observations and actions of the agent.
+        config: Settings of the learner.
         device: Where the networks live and updates run.
-        seed: Of the initial weights; None takes them from the global generator.
+        seed: Seed of the initial weights; None draws them from the global generator.
 
     Example:
         >>> learner = PPOLearner(NetworkSize(2, 32), Interface(pixels=False, vector_dim=21), seed=0)
@@ -117,7 +117,7 @@ class PPOLearner(BaselineLearner):
         """Make ``epochs`` passes of gradient steps over a rollout.
 
         Args:
-            rollout: Batch ``[N, T]`` as a collector returns it.
+            rollout: A collector's rollout ``[N, T]``.
             timed: Context manager by activity (``advantages``, ``optimise``).
 
         Returns:
@@ -139,7 +139,7 @@ class PPOLearner(BaselineLearner):
         return {name: torch.stack([step[name] for step in steps]).mean() for name in steps[0]}
 
     def value_function(self) -> ValueFunction:
-        """Return what the critic makes of what is seen, in units of the reward."""
+        """Return the critic's values of observations, in units of the unscaled reward."""
 
         @torch.no_grad()
         def value(acted: TensorDictBase) -> Tensor:
@@ -165,10 +165,10 @@ class PPOLearner(BaselineLearner):
         return records.update({"advantage": advantage, "value_target": target}).flatten()
 
     def _values_and_next(self, records: TensorDictBase, following: TensorDictBase) -> tuple[Tensor, Tensor]:
-        """Return the values of what was seen and of what came next, ``(N, T, 1)`` each.
+        """Return the values of observations and of next observations, ``(N, T, 1)`` each.
 
-        What comes next is what is seen in the next step, but for the last step and where an episode was cut off; after
-        a crash it counts for nothing. So hardly any image is looked at twice.
+        The next observation is that of the next step, except at the rollout's last step and at truncations, where it
+        is evaluated separately; after a termination its value does not matter. So few images are evaluated twice.
         """
         value = self._values(records.flatten()).view(*records.shape, 1)
         next_value = torch.cat((value[:, 1:], value[:, -1:]), 1)
@@ -180,7 +180,7 @@ class PPOLearner(BaselineLearner):
         return value, next_value
 
     def _values(self, records: TensorDictBase) -> Tensor:
-        """Return the values of records ``[N]``, ``(N, 1)``, in parts, for a rollout of images is large."""
+        """Return the values ``(N, 1)`` of records ``[N]``, in chunks, because a rollout of images is large."""
         seen, size = records.select(*self._keys), max(1, math.ceil(len(records) / self.config.minibatches))
         starts = range(0, max(1, len(records)), size)
         return torch.cat([self.critic(seen[start : start + size])["state_value"] for start in starts])
@@ -206,16 +206,16 @@ class PPOLearner(BaselineLearner):
 
 
 class ClippedNormal(IndependentNormal):
-    """Normals whose samples the environment clips to [−1, 1], and whose deterministic sample is the mean of those."""
+    """Normal distribution whose deterministic sample is the mean of its samples clipped to [−1, 1]."""
 
     @property
     def deterministic_sample(self) -> Tensor:
-        """Mean of what the environment gets, ``(..., A)``."""
+        """Mean of the clipped actions, ``(..., A)``."""
         return clipped_mean(self.base_dist.loc, self.base_dist.scale)
 
 
 def _make_actor(interface: Interface, size: NetworkSize, initial_std: float) -> ProbabilisticActor:
-    """Make a normal whose mean depends on what is seen, and whose deviation does not."""
+    """Make an actor whose mean depends on the observation, and whose standard deviation does not."""
     network = ObservationNetwork(interface, interface.action_dim, size, output_scale=0.01)
     deviation = AddStateIndependentNormalScale(interface.action_dim, init_value=math.log(initial_std))
     return ProbabilisticActor(

@@ -25,24 +25,24 @@ from dreamer_racing.learners.networks import (
 from dreamer_racing.modules import Interface
 from dreamer_racing.settings import COUNT, POSITIVE, SHARE, setting
 
-NO_WEIGHT = 1e-30  # beside a transition's 1: lost in float32, but a sum of it is not 0
+NO_WEIGHT = 1e-30  # negligible beside a transition's weight of 1, but a sum of such weights is not 0
 
 
 @dataclass
 class SACConfig:
-    """Numbers of the learner.
+    """Settings of the SAC learner.
 
     Attributes:
-        learning_rate: Of Adam, for actor, critics and temperature.
-        batch_size: B, transitions.
+        learning_rate: Learning rate of Adam for actor, critics and temperature.
+        batch_size: B, number of transitions in a batch.
         replay_ratio: Transitions trained on per environment step.
         discount: γ.
-        target_rate: Fraction by which the target critics move at each update.
-        initial_alpha: Temperature at the start; it is learned, towards an entropy of −A nats.
+        target_rate: Fraction by which the target critics move towards the critics at each update.
+        initial_alpha: Initial temperature, which is learned towards an entropy of −A nats.
         reward_scale: Factor on rewards.
 
-    Reference: Haarnoja et al. 2018, "Soft actor-critic algorithms and applications"; numbers of Stable-Baselines3, but
-    for batch size and replay ratio (there are many worlds), temperature and scale of rewards [choice].
+    Reference: Haarnoja et al. 2018, "Soft actor-critic algorithms and applications"; numbers of Stable-Baselines3,
+    except batch size and replay ratio (for many environments), temperature and scale of rewards [choice].
     """
 
     learning_rate: float = setting(3e-4, POSITIVE)
@@ -58,11 +58,11 @@ class SACLearner(BaselineLearner):
     """Actor and two critics with TorchRL's ``SACLoss``, and one optimiser.
 
     Args:
-        size: Of all networks.
-        interface: What the agent sees and does.
-        config: Numbers of the learner.
+        size: Size of all networks.
+        interface: Observations and actions of the agent.
+        config: Settings of the learner.
         device: Where the networks live and updates run.
-        seed: Of the initial weights; None takes them from the global generator.
+        seed: Seed of the initial weights; None draws them from the global generator.
 
     Example:
         >>> learner = SACLearner(NetworkSize(2, 32), Interface(pixels=False, vector_dim=21), seed=0)
@@ -131,10 +131,10 @@ class SACLearner(BaselineLearner):
         return metrics
 
     def transitions(self, windows: TensorDictBase) -> TensorDict:
-        """Make transitions ``[B]`` of windows of two records.
+        """Make transitions ``[B]`` from windows of two records.
 
-        Where the second record begins an episode there was no transition from the first: it has next to no weight (not
-        none, for a batch of nothing else would have no mean).
+        If the second record begins an episode, there is no transition: its weight is ``NO_WEIGHT`` instead of 0, so
+        that the weighted mean of a batch without any transition is still defined.
         """
         before, after = windows[:, 0], windows[:, 1]
         following = {key: after.get(key) for key in self._keys}
@@ -157,7 +157,7 @@ class SACLearner(BaselineLearner):
 
 
 def _make_actor(interface: Interface, size: NetworkSize) -> ProbabilisticActor:
-    """Make a normal whose mean and deviation depend on what is seen, squashed into [−1, 1]."""
+    """Make an actor whose mean and standard deviation depend on the observation, squashed into [−1, 1] by tanh."""
     network = ObservationNetwork(interface, 2 * interface.action_dim, size, output_scale=0.01)
     return ProbabilisticActor(
         NetworkModule(GaussianNetwork(network, NormalParamExtractor()), ["loc", "scale"]),

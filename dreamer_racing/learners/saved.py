@@ -1,4 +1,4 @@
-"""What a saved learner holds, and whether it fits the learner that loads it."""
+"""Checks that the saved state of a learner fits the learner that loads it."""
 
 from __future__ import annotations
 
@@ -11,30 +11,29 @@ from torch import Tensor, nn
 from dreamer_racing.modules import Agent, ModelSize
 
 VARIANTS = ("sampled", "state_std")
-"""What of a `ModelSize` the command line chooses beside the size, as ``model.sampled=false``."""
+"""Fields of `ModelSize` with command-line options of their own, such as ``model.sampled=false``."""
 Parts = dict[str, tuple[dict[str, Tensor], dict[str, Tensor]]]
-"""What is wanted of a part of a learner, and what is found, by the part's name."""
+"""Expected and saved state of each part of a learner, by the part's name."""
 
 
 def own_state(network: nn.Module, agent: Agent) -> dict[str, Tensor]:
-    """Return a network's state without that of the agent's networks, which it holds under whatever names."""
+    """Return a network's state without the tensors that it shares with the agent."""
     shared = {id(tensor) for tensor in agent.state_dict(keep_vars=True).values()}
     state = network.state_dict(keep_vars=True)
     return {key: tensor.detach() for key, tensor in state.items() if id(tensor) not in shared}
 
 
 def check_saved(saved: dict[str, Any], algorithm: str, agent: Agent, own_networks: Mapping[str, nn.Module]) -> None:
-    """Refuse what another learner saved.
+    """Check that a saved learner can be resumed by this one.
 
     Args:
         saved: ``state_dict()`` of a learner.
-        algorithm: Of the one that is to load it.
-        agent: Its networks.
-        own_networks: And those that are no part of the agent.
+        algorithm: Algorithm of the learner that loads it.
+        agent: Networks of that learner.
+        own_networks: Its networks that are not part of the agent.
 
     Raises:
-        ValueError: If it is that of another algorithm, of a model of another size, of other losses or of another
-            environment.
+        ValueError: If it was saved with another algorithm, model size, loss or environment.
     """
     check_format(saved)
     if saved["algorithm"] != algorithm:
@@ -50,27 +49,27 @@ def check_saved(saved: dict[str, Any], algorithm: str, agent: Agent, own_network
 
 
 class Unmatched(NamedTuple):
-    """Networks that are no part of an agent, by name, that only one of two learners has."""
+    """Names of networks outside the agent that only one of two learners has."""
 
     anew: list[str]
-    """Those of the learner that takes weights over: they begin anew."""
+    """Networks of the loading learner only; they keep their initial weights."""
     left: list[str]
-    """Those of the saved one: they are left behind."""
+    """Networks of the saved learner only; they are not loaded."""
 
 
 def check_weights(saved: dict[str, Any], agent: Agent, own_networks: Mapping[str, nn.Module]) -> Unmatched:
-    """Refuse what another learner saved, if the agent's networks are not in it.
+    """Check that the weights of a saved learner can be loaded, whatever its algorithm.
 
     Args:
         saved: ``state_dict()`` of a learner.
-        agent: The networks that are to load it.
-        own_networks: Those that are no part of it; of them those that are there must be of the same shapes.
+        agent: Agent that loads the weights.
+        own_networks: Networks outside the agent; those that were also saved must have the same shapes.
 
     Returns:
-        The own networks that only one of the two has.
+        The networks outside the agent that only one of the two learners has.
 
     Raises:
-        ValueError: If it is that of a model of another size or of another environment.
+        ValueError: If it was saved with another model size or environment.
     """
     check_format(saved)
     check_size(saved["size"], agent.size)
@@ -86,30 +85,30 @@ def check_weights(saved: dict[str, Any], agent: Agent, own_networks: Mapping[str
 
 
 def check_format(saved: dict[str, Any]) -> None:
-    """Refuse the state of a learner as it was saved before the format of this version.
+    """Check that the state of a learner has the format of this version.
 
     Raises:
-        ValueError: If it is one.
+        ValueError: If it has an older format.
     """
     if "own_networks" not in saved:
         raise ValueError("The checkpoint was saved in a format that this version does not read: train anew.")
 
 
 def load_parameters(module: nn.Module, saved: Mapping[str, Tensor]) -> None:
-    """Load the parameters of a module from a state, and leave its buffers alone."""
+    """Load the parameters of a module from a state, but not its buffers."""
     own = dict(module.named_parameters())
     module.load_state_dict({name: value for name, value in saved.items() if name in own}, strict=False)
 
 
 def check_size(checkpoint: dict[str, Any], size: ModelSize) -> None:
-    """Refuse the state of a model of another size.
+    """Check that a saved model has this size.
 
     Args:
         checkpoint: ``state_dict()["size"]`` of a learner.
-        size: The size of the learner that loads it.
+        size: Size of the model of the learner that loads it.
 
     Raises:
-        ValueError: If they differ in anything but the name; the message says in what, and what to do.
+        ValueError: If they differ in anything but the name; the message gives the differences and what to do.
     """
     wanted = asdict(size)
     names = [field.name for field in fields(size) if field.name != "name"]
@@ -126,12 +125,12 @@ def check_size(checkpoint: dict[str, Any], size: ModelSize) -> None:
 
 
 def _plain(value: Any) -> Any:
-    """Return tuples as lists, as files keep them."""
+    """Return a tuple as a list, as files store it."""
     return list(value) if isinstance(value, tuple) else value
 
 
 def _name(network: str, key: str) -> str:
-    """Return what is said to be one network: a critic as a whole, of the world-model loss each target."""
+    """Return the reported name of a parameter's network; each target of the world-model loss counts as a network."""
     return key.partition(".")[2].partition(".")[0] if key.startswith("targets.") else network
 
 
@@ -140,7 +139,7 @@ def _names(states: Mapping[str, Mapping[str, Tensor]]) -> set[str]:
 
 
 def _check_parts(parts: Parts, saved: dict[str, Any], agent: Agent) -> None:
-    """Refuse parts of other parameters than these."""
+    """Raise ``ValueError`` if the names or shapes of expected and saved parameters differ."""
     there, here = saved["image_size"], agent.interface.image_size
     where = (
         "in an environment of other observations or actions"

@@ -1,4 +1,4 @@
-"""What every learner with a world model needs around its losses: one gradient step, averaged weights, and its state.
+"""Base class of learners with a world model: gradient step, averaged weights and saved state around the losses.
 
 Shape legend: B batch, T time, N environments, D belief, S state, F = D + S features.
 """
@@ -30,31 +30,31 @@ from dreamer_racing.settings import check_settings
 
 
 class WorldModelLearner(ABC):
-    """Trains an agent's networks by what ``compute_losses`` of an algorithm returns.
+    """Base of learners that minimise the losses of ``compute_losses``.
 
     Args:
         agent: The networks, on the device where updates run.
-        losses: Numbers of the losses.
-        config: Numbers of the update.
+        losses: Settings of the losses.
+        config: Settings of the update.
 
     Attributes:
-        algorithm: Its name; a checkpoint is of one algorithm.
-        loss_config: Numbers of the losses.
-        world_model_loss: Of the agent's world model.
-        behavior: Networks of the agent that the optimiser trains beside the world model.
-        own_networks: That are no part of the agent, by their names: the world-model loss, with what its targets learn,
-            and those of the algorithm.
-        optimizer: Of both; its first group is the world model, its second the behaviour.
-        latents: Belief and state of the last batch's records, ``[B, T]``, for the replay's context; on a CUDA device
-            with ``cuda_graph`` the next update writes over them.
-        averaged: A copy of the agent whose weights are averages, if they are kept.
-        discount: γ, a scalar; ``adjust`` moves it.
-        entropy_scale: Weight of the actor's entropy, a scalar; likewise.
+        algorithm: Name of the algorithm; a checkpoint belongs to one algorithm.
+        loss_config: Settings of the losses.
+        world_model_loss: Loss of the agent's world model.
+        behavior: Names of the agent's networks that the optimiser trains besides the world model.
+        own_networks: Networks that are not part of the agent, by name: the world-model loss with the networks of its
+            targets, and those of the algorithm.
+        optimizer: Optimiser with two groups: the world model, and the ``behavior`` networks.
+        latents: Belief and state of the last batch's records, ``[B, T]``, to refresh the replay's latents; with
+            ``cuda_graph`` the next update overwrites them.
+        averaged: Copy of the agent with exponentially averaged weights, or None.
+        discount: γ, a scalar that ``adjust`` can change.
+        entropy_scale: Weight of the actor's entropy, likewise.
         horizon: H, imagined actions from each start.
-        updates: Made so far.
+        updates: Number of updates so far.
 
     Raises:
-        ValueError: If a number is out of its range, or there is no loss of a name.
+        ValueError: If a setting is out of its range, or a loss is unknown.
     """
 
     algorithm: ClassVar[str]
@@ -97,19 +97,19 @@ class WorldModelLearner(ABC):
         device: torch.device | str = "cpu",
         seed: int | None = None,
     ) -> Self:
-        """Make the networks of an agent, and their learner.
+        """Make an agent and its learner.
 
         Args:
-            size: Of the networks, or its name.
-            interface: What the agent sees and does; ``Interface.of(env)`` reads it off an environment.
-            losses: Numbers of the losses.
-            config: Numbers of the update.
+            size: Model size, or its name.
+            interface: Observations and actions of the agent; ``Interface.of(env)`` derives it from an environment.
+            losses: Settings of the losses.
+            config: Settings of the update.
             device: Where the networks live and updates run.
-            seed: Of the initial weights; None takes them from the global generator. Later sampling always uses the
-                global generator of the device, which a checkpoint of yours should save.
+            seed: Seed of the initial weights; None draws them from the global generator. Later sampling always uses the
+                device's global generator, which your checkpoints should save, too.
 
         Raises:
-            ValueError: If a number is out of its range, or there is no loss of a name.
+            ValueError: If a setting is out of its range, or a loss is unknown.
         """
         losses = losses or cls.Losses()
         check_settings(losses)
@@ -127,77 +127,77 @@ class WorldModelLearner(ABC):
         """Learn from a batch of replayed records.
 
         Args:
-            batch: Batch size ``[B, T]``: what the encoder sees, ``previous_action``, ``reward``, ``is_init``,
-                ``terminated``, ``truncated``; scalars ``(B, T, 1)``; and ``context``, from whose first record windows
-                go on where it is there, and which ``drift_scale`` needs.
-            timed: Context manager by activity (``world_model``, ``imagine``, of actor and critic whether they imagine
-                or not, ``optimise``, ``improve``), to measure the time spent in each; tells them apart only on a CPU.
+            batch: Batch size ``[B, T]``: the encoder's observations, ``previous_action``, ``reward``, ``is_init``,
+                ``terminated``, ``truncated``, scalars ``(B, T, 1)``; optionally ``context``, the stored latents, from
+                which windows then start, and which ``drift_scale`` requires.
+            timed: Makes a context manager that times an activity: ``world_model``, ``imagine`` (actor and critic, even
+                if nothing is imagined), ``optimise``, ``improve``. The split is only meaningful on a CPU.
 
         Returns:
-            Scalar tensors on the device: every loss and metric of those that were computed, ``gradient_norm/<network>``
-            (before clipping) and ``loss``. Reading one waits for the device; do it seldom.
+            Scalar tensors on the device: all losses and metrics that were computed, ``gradient_norm/<network>`` (before
+            clipping) and ``loss``. Reading one waits for the device, so do it rarely.
 
         Raises:
-            KeyError: If the batch lacks what a loss reads.
-            NonFiniteLossError: If loss, gradient or a reward is not finite. On a CPU no network has been changed by it;
-                on a CUDA device this is noticed two updates late, because waiting for the device would stall it.
+            KeyError: If the batch lacks a key that a loss needs.
+            NonFiniteLossError: If a loss, gradient or reward is not finite. On a CPU the networks are unchanged then;
+                on a CUDA device it is raised two updates late, because waiting for the device would stall it.
         """
 
     def collect(self, rollout: TensorDictBase) -> None:  # noqa: B027 - only on-policy learners need it
-        """Take note of a collector's rollout ``[N, T]``, of `policy`, perhaps with older weights; here nothing."""
+        """Store a collector's rollout ``[N, T]``, flown by `policy`, perhaps with older weights; here do nothing."""
 
     @property
     def modules(self) -> nn.ModuleDict:
-        """All that a gradient step reads and writes."""
+        """Modules that a gradient step reads and writes."""
         return nn.ModuleDict({"agent": self.agent, "world_model_loss": self.world_model_loss})
 
     def make_networks(self) -> dict[str, nn.Module]:
-        """Make the networks of the algorithm that are no part of the agent, by their names; here none."""
+        """Make the algorithm's networks that are not part of the agent, by name; here none."""
         return {}
 
     @property
     def weights(self) -> list[Tensor]:
-        """All that is learned: networks and averages."""
+        """Parameters of all networks, including the averaged ones."""
         averaged = [] if self.averaged is None else [self.averaged]
         return list(nn.ModuleList([self.agent, *self.own_networks.values(), *averaged]).parameters())
 
     @property
     def size(self) -> ModelSize:
-        """Of the networks."""
+        """Size of the networks."""
         return self.agent.size
 
     @property
     def latent_format(self) -> LatentFormat:
-        """How a replay keeps this learner's latents."""
+        """Format in which a replay buffer stores this learner's latents."""
         return self.agent.world_model.rssm.latent_format
 
     @property
     def flying_agent(self) -> Agent:
-        """What is evaluated and exported: the averaged networks where they are kept, else those that are trained."""
+        """Agent that is evaluated and exported: the averaged one if it is kept, else the trained one."""
         return self.agent if self.averaged is None else self.averaged
 
     def policy(self, deterministic: bool = False) -> DreamerPolicy:
-        """Return the acting step of the networks that are trained, which shares their parameters."""
+        """Return the policy of the trained networks, which shares their parameters."""
         return DreamerPolicy(self.agent.world_model, self.agent.actor, deterministic)
 
     def evaluation_policy(self) -> DreamerPolicy:
-        """Return the acting step of `flying_agent`, which shares its parameters."""
+        """Return the policy of `flying_agent`, which shares its parameters."""
         return DreamerPolicy(self.flying_agent.world_model, self.flying_agent.actor)
 
     def value_function(self) -> ValueFunction:
-        """Return what the critic that teaches the actor makes of a state."""
+        """Return the value function of the critic that the actor learns from."""
         return self._value_of_latents
 
     @torch.no_grad()
     def _value_of_latents(self, acted: TensorDictBase) -> Tensor:
-        """Return what the critic makes of the latents that `DreamerPolicy` has updated by what it saw, ``(N, 1)``."""
+        """Return the critic's values ``(N, 1)`` at the latents that `DreamerPolicy` wrote under "next"."""
         after = acted["next"].select("belief", "state").to(self.device)
         return self.flying_agent.critic.value(join_features(after["belief"], after["state"]))
 
     def open_loop(self, batch: TensorDictBase, num_observed: int) -> tuple[Tensor, Tensor]:
         """Observe the first ``num_observed`` records of a batch ``[B, T]``, then predict the others from their actions.
 
-        By the networks that are trained, also where averaged ones fly: a loss's own decoder has no average.
+        Always by the trained networks, not the averaged ones, because the decoders of targets have no average.
 
         Returns:
             Beliefs ``(B, T, D)`` and states ``(B, T, S)``.
@@ -208,7 +208,7 @@ class WorldModelLearner(ABC):
         )
 
     def drift_losses(self, latents: Latents, batch: TensorDictBase) -> dict[str, Tensor]:
-        """Return ``loss_drift`` and ``policy_drift`` at the records of a batch ``[B, T]`` whose latents are stored."""
+        """Return ``loss_drift`` and ``policy_drift`` of a batch ``[B, T]`` with stored latents, if turned on."""
         scale = self.loss_config.drift_scale
         if not scale:
             return {}
@@ -222,22 +222,22 @@ class WorldModelLearner(ABC):
         return {"loss_drift": scale * drift, "policy_drift": drift.detach()}
 
     def then_and_now(self, latents: Latents, batch: TensorDictBase) -> tuple[Tensor, Tensor, Tensor]:
-        """Return features of records as they were stored and as the model makes them now.
+        """Return the stored and the current features of the same records.
 
         Args:
-            latents: Of a batch's records now.
-            batch: The records ``[B, T]``, with ``context``: each has the latents of the one before it.
+            latents: Current latents of a batch's records.
+            batch: The records ``[B, T]``, with ``context``: each stores the latents of the record before it.
 
         Returns:
-            Both of all but the last record, ``(B, T - 1, F)``, and whether they are of the same one, bool
-            ``(B, T - 1, 1)``: what the first record of an episode has stored is not of the one before it.
+            Stored and current features of all records but the last, ``(B, T - 1, F)`` each, and a bool mask
+            ``(B, T - 1, 1)`` that is False where the next record begins an episode, and so stores other latents.
         """
         before = join_features(*self.latent_format.unpack(batch[CONTEXT][:, 1:]))
         after = join_features(latents.belief[:, :-1], latents.state[:, :-1])
         return before, after, ~batch["is_init"][:, 1:]
 
     def gradient_step(self, batch: TensorDictBase, timed: Timer) -> dict[str, Tensor]:
-        """Make one gradient step on a batch ``[B, T]``; return what `update` does."""
+        """Make one gradient step on a batch ``[B, T]``; return its losses and metrics as `update` does."""
         batch = batch.to(self.device, non_blocking=True)
         metrics = self._backward(batch, timed) if self._graph is None else self._graph(batch)
         if parallel.count() > 1:
@@ -265,11 +265,11 @@ class WorldModelLearner(ABC):
         return {key: value.detach() for key, value in (metrics | norms | {"loss": total}).items()}
 
     def _of_all_processes(self, metrics: dict[str, Tensor], timed: Timer) -> dict[str, Tensor]:
-        """Turn gradients and metrics of this process's share of the batch into those of the joint batch.
+        """Average gradients and metrics over the processes, to those of the joint batch.
 
-        One exchange of a flat tensor between backward and the optimiser's step, behind a captured graph, and not
-        ``DistributedDataParallel``: gradients come from one backward through several losses, and a metric that is not
-        finite reaches all processes with them, so that all stop at the same update.
+        It is one all-reduce of a flat tensor between backward pass and optimiser step, outside of the captured graph,
+        instead of ``DistributedDataParallel``: one backward pass serves several losses, and a non-finite metric reaches
+        all processes with the gradients, so that all stop at the same update.
         """
         with timed("exchange"):
             networks = (parameter for parameters in self._trained.values() for parameter in parameters)
@@ -278,7 +278,7 @@ class WorldModelLearner(ABC):
 
     @torch.no_grad()
     def average_weights(self) -> None:
-        """Move the averaged weights, if they are kept; while there are few updates they are the plain mean of all."""
+        """Update the averaged weights, if they are kept; during the first updates they are the plain mean of all."""
         if self.averaged is not None and self.config.average_rate is not None:
             rate = max(self.config.average_rate, 1.0 / self.updates)
             torch._foreach_lerp_(list(self.averaged.parameters()), list(self.agent.parameters()), rate)
@@ -294,23 +294,22 @@ class WorldModelLearner(ABC):
         max_std: float | None = None,
         **others: Any,
     ) -> None:
-        """Change what a run may have on a schedule, from the next update on; what is not named stays.
+        """Set scheduled hyperparameters, from the next update on; the others stay as they are.
 
         These are settings, not state: call it again after `load_state_dict`.
 
         Args:
-            rates: Share of the learning rates that the learner was made with, of all optimisers.
-            world_model_rate: Share of that share, of the world model's alone; given together with ``rates``.
+            rates: Factor on the configured learning rates of all optimisers.
+            world_model_rate: Further factor on the world model's learning rate; needs ``rates``.
             discount: γ.
             entropy_scale: Weight of the actor's entropy.
-            min_std: Smallest standard deviation of actions, of the networks' own.
-            max_std: Largest.
-
-            others: None that all learners have.
+            min_std: Smallest standard deviation of actions, for the trained and the averaged actor.
+            max_std: Largest standard deviation of actions, likewise.
+            others: Hyperparameters of other algorithms, which are refused.
 
         Raises:
-            TypeError: There are others.
-            ValueError: ``world_model_rate`` is given alone.
+            TypeError: If there are ``others``.
+            ValueError: If ``world_model_rate`` is given without ``rates``.
         """
         if others:
             raise TypeError(
@@ -332,7 +331,7 @@ class WorldModelLearner(ABC):
                     agent.actor.get_buffer(name).fill_(bound)
 
     def check_finite(self) -> None:
-        """Wait for the latest updates, so that nothing bad is saved.
+        """Wait for pending updates, so that no bad weights are saved.
 
         Raises:
             NonFiniteLossError: If one of them was not finite.
@@ -340,11 +339,11 @@ class WorldModelLearner(ABC):
         self._guard.settle()
 
     def autocast(self) -> torch.autocast:
-        """Return the context in which the networks run: bfloat16 where it does not matter, if ``mixed_precision``."""
+        """Return the autocast context of the networks: bfloat16 if ``mixed_precision``, else off."""
         return autocast(self.device, bool(self.config.mixed_precision))
 
     def state_dict(self) -> dict[str, Any]:
-        """Return everything that the next update depends on, but for the global random generators."""
+        """Return everything that the next update depends on, except the global random generators."""
         return {
             "algorithm": self.algorithm,
             "size": asdict(self.size),
@@ -360,8 +359,8 @@ class WorldModelLearner(ABC):
         """Restore what ``state_dict`` returned.
 
         Raises:
-            ValueError: If it is that of another algorithm, of a model of another size, of other losses or of another
-                environment; nothing is changed then.
+            ValueError: If it was saved with another algorithm, model size, loss or environment; nothing is changed
+                then.
         """
         check_saved(state_dict, self.algorithm, self.agent, self.own_networks)
         self.agent.load_state_dict(state_dict["agent"])
@@ -373,17 +372,17 @@ class WorldModelLearner(ABC):
         self.updates = state_dict["updates"]
 
     def adopt(self, state_dict: dict[str, Any]) -> Unmatched:
-        """Take over the weights of what another learner's ``state_dict`` returned, whatever its algorithm.
+        """Load the weights of another learner's ``state_dict``, whatever its algorithm.
 
-        They are those that flew, so the averaged ones where it kept them, and nothing else: no optimiser, no counters,
-        no bounds of the actor's deviation, neither collected steps nor statistics. A network that is no part of the
-        agent and that the other has not, as a critic of the state, begins anew.
+        They are the weights that were evaluated: the averaged ones if it kept them. Nothing else is loaded: no
+        optimiser, counters, bounds of the actor's standard deviation, collected steps or statistics. A network outside
+        the agent that the other learner lacks, such as a critic of the state, keeps its initial weights.
 
         Returns:
-            The own networks that begin anew, and those that are left behind.
+            Networks outside the agent that keep their initial weights, and saved ones that are not loaded.
 
         Raises:
-            ValueError: If it is that of a model of another size or of another environment; nothing is changed then.
+            ValueError: If it was saved with another model size or environment; nothing is changed then.
         """
         unmatched = check_weights(state_dict, self.agent, self.own_networks)
         flying = state_dict.get("averaged", state_dict["agent"])
@@ -394,7 +393,7 @@ class WorldModelLearner(ABC):
         return unmatched
 
     def _parameters(self) -> dict[str, list[nn.Parameter]]:
-        """Return what a gradient step trains, by the network's name; the world model with what its loss has."""
+        """Return the trained parameters by network; the world model's include those of its loss."""
         networks: dict[str, list[nn.Module]] = {"world_model": [self.agent.world_model, self.world_model_loss]}
         networks |= {name: [self.agent.get_submodule(name)] for name in self.behavior}
         return {
@@ -411,16 +410,16 @@ class WorldModelLearner(ABC):
         return make_optimizer(groups, self.config.warmup_updates)
 
     def _make_graph(self) -> GraphedStep:
-        """Return what replays ``_backward`` as one CUDA graph."""
+        """Return ``_backward`` as a step that is replayed as one CUDA graph."""
         if self.device.type != "cuda":
             raise ValueError(f"cuda_graph=True needs a CUDA device, but the learner is on {str(self.device)!r}.")
         return GraphedStep(self._backward, self.modules)
 
     def _weights(self) -> AbstractContextManager:
-        """Return the context in which layers have their weights in the type that autocast computes in."""
+        """Return the context in which weights are cast to bfloat16 once per update, if so configured."""
         return cast_once(self.modules, torch.bfloat16) if self._casts_once else nullcontext()
 
     def note_latents(self, latents: Latents) -> None:
-        """Keep the latents of a batch's records for the replay."""
+        """Keep the latents of a batch's records, to refresh those in the replay buffer."""
         shape = latents.belief.shape[:2]
         self.latents = TensorDict({"belief": latents.belief.detach(), "state": latents.state.detach()}, shape)

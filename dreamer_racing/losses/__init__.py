@@ -1,6 +1,6 @@
 """Losses of the world model, the policy and the critic: pure functions and small modules.
 
-What may be of your own is found by ``find_targets`` and ``find_objective``; ``docs/losses.md`` says how to write it.
+``find_targets`` and ``find_objective`` also import a user's own ones; ``docs/losses.md`` says how to write them.
 """
 
 from dreamer_racing.losses.config import (

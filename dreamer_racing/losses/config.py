@@ -1,4 +1,4 @@
-"""Every number of the losses, in one place."""
+"""Configuration of the losses."""
 
 from __future__ import annotations
 
@@ -8,30 +8,30 @@ from dreamer_racing.modules.heads import MAX_STD, MIN_STD
 from dreamer_racing.settings import COUNT, NOT_NEGATIVE, POSITIVE, POSITIVE_SHARE, SHARE, setting
 
 HORIZON = 16
-"""H, imagined actions from each start, where nobody says; in recipes ``model.imagination_horizon`` does.
+"""Default of H, imagined actions from each start; recipes set ``model.imagination_horizon``.
 Reference: Dream to Fly, where T = 16; danijar/dreamerv3 has 15 (``imag_length``)."""
 KL_TOLERANCE = 1.5
-"""Factor that a divergence may be off its target. Reference: Schulman et al. 2017, Section 4."""
+"""Factor by which a KL divergence may differ from its target. Reference: Schulman et al. 2017, Section 4."""
 
 
 @dataclass
 class PPOUpdateConfig:
-    """Numbers of an update on collected steps, of the actor and of its critic [choice, unless a source is named].
+    """Settings of PPO updates of the actor and its critic on collected steps [choice, unless a source is named].
 
     Attributes:
-        steps: Collected ones, summed over environments, that one update of the actor learns from.
-        epochs: Times that every step is trained on.
-        minibatch: M, steps of a gradient step.
+        steps: Number of collected steps, summed over environments, per PPO update.
+        epochs: Number of passes over these steps.
+        minibatch: M, steps per minibatch.
         clip_epsilon: ε of the clipped ratio. Reference: Schulman et al. 2017.
-        advantage_clip: Largest normalised advantage.
-        kl_stop: Divergence KL(before ‖ now) of what the update's own steps did, nats, beyond which the remaining
-            minibatches are left out.
-        kl_target: The same before an update's last gradient step, nats, to which the learning rate is steered:
-            1.5 times more, and the next update is made at a lower one, 1.5 times less, and at a higher one; None: it
-            stays. Reference: Schulman et al. 2017, Section 4, who steer the weight of a KL penalty so.
-        learning_rate: Of the actor's Adam; the largest, where there is a ``kl_target``.
-        critic_learning_rate: Of the critic's.
-        gradient_clip: Largest norm of the gradient, of the actor or that critic.
+        advantage_clip: Largest absolute value of a normalised advantage.
+        kl_stop: KL divergence KL(before ‖ now) of the policy within an update, nats, above which the update's remaining
+            minibatches are skipped.
+        kl_target: Target of that divergence before an update's last gradient step, nats. If the divergence is more than
+            1.5 times the target, the next update has a lower learning rate; if it is less than the target / 1.5, a
+            higher one. None keeps the rate. Reference: Schulman et al. 2017, Section 4 (there of a KL penalty).
+        learning_rate: Learning rate of the actor's Adam; with a ``kl_target``, its maximum.
+        critic_learning_rate: Learning rate of the critic's Adam.
+        gradient_clip: Maximum norm of the gradient, of the actor and of the critic.
     """
 
     steps: int = setting(8_192, COUNT)
@@ -48,28 +48,28 @@ class PPOUpdateConfig:
 
 @dataclass
 class LossConfig:
-    """Numbers of the losses that every algorithm with a world model has.
+    """Settings of the losses that every algorithm with a world model has.
 
     Attributes:
-        world_model: What shapes the latents beside rewards, a name of ``dreamer_racing.losses.TARGETS``:
-            ``reconstruction``, ``informed``, ``privileged``, ``decoder_free`` or ``reward_only``; or ``module:Class``
-            of your own; several are joined by ``+``.
+        world_model: Targets that shape the latents besides rewards, a name of ``dreamer_racing.losses.TARGETS``:
+            ``reconstruction``, ``informed``, ``privileged``, ``decoder_free`` or ``reward_only``; or your own
+            ``module:Class``. Several are joined by ``+``.
         discount: γ.
         lambda_: λ of the returns.
         entropy_scale: Weight of the actor's entropy.
-        min_std: Smallest standard deviation of actions. The reference has 0.1; more keeps the actor exploring where a
-            first way of doing something has made it sure of itself.
+        min_std: Smallest standard deviation of actions. The reference has 0.1; a larger one keeps the actor exploring
+            after it has converged to a first solution.
         max_std: Largest standard deviation of actions. The reference has 1.
         dynamics_scale: Weight of the dynamics loss.
         representation_scale: Weight of the representation loss.
-        free_nats: KL, summed over latents, below which there is no gradient, nats.
-        image_scale: Weight of the images' reconstruction: ``reconstruction`` and ``informed``. The reference has 1.
-        image_share: Share of a window's records, at least one, whose images are decoded, drawn anew in every update;
-            the reference decodes all. Less makes an update cheaper.
-        privileged_scale: Weight of decoding the simulator's state: ``informed`` and ``privileged``.
-        barlow_scale: Weight of the redundancy reduction: ``decoder_free``.
-        drift_scale: Weight of ``policy_drift``, where a replay keeps latents that are not drawn
-            (``replay.context=true``, ``model.sampled=false``); 0 turns it off.
+        free_nats: KL divergence, summed over latents, below which there is no gradient, nats.
+        image_scale: Weight of the image reconstruction in ``reconstruction`` and ``informed``. The reference has 1.
+        image_share: Share of a window's records, at least one, whose images are decoded; drawn at random in each
+            update. The reference decodes all; fewer make an update cheaper.
+        privileged_scale: Weight of decoding the simulator's state in ``informed`` and ``privileged``.
+        barlow_scale: Weight of the redundancy reduction in ``decoder_free``.
+        drift_scale: Weight of ``policy_drift``; needs stored latents that are not sampled (``replay.context=true``,
+            ``model.sampled=false``). 0 turns it off.
         slow_critic_scale: Weight of the critic's regularisation towards its slow copy.
         replay_value_scale: Weight of the critic's loss on replayed returns; 0 turns it off.
         replay_value_gradient: Whether that loss also trains the world model's representation, as in the reference.
@@ -98,18 +98,18 @@ class LossConfig:
 
 @dataclass
 class DreamerV3Losses(LossConfig):
-    """And those of an actor that learns in imagination.
+    """Settings of the losses of DreamerV3, whose actor learns in imagination.
 
     Attributes:
-        actor: Its objective: ``reinforce``, ``dynamics``, or ``module:function`` of your own.
+        actor: Objective of the actor: ``reinforce``, ``dynamics``, or your own ``module:function``.
         return_decay: Decay of the moving percentiles of returns.
         continuation: Whether predicted ends of episodes cut imagined returns.
-        open_loop_steps: Steps ahead for which rewards and ends are learned from replayed actions alone, as imagination
-            reads them (`open_loop_loss`); 0, as in the reference: only where latents were observed.
+        open_loop_steps: Steps over which rewards and episode ends are also predicted from replayed actions alone, as in
+            imagination (`open_loop_loss`). 0, as in the reference, learns them only at observed latents.
         action_change_scale: Weight of the squared change of the policy's mean from one imagined step to the next
             (`Trajectory.action_change`) in the actor's loss; the reference has none.
-        actor_begin: Updates after which the actor begins to learn. The gradient of the dynamics is followed as surely
-            where the model is wrong: an actor that begins with the model is soon saturated. The reference has 0.
+        actor_begin: Number of updates before the actor starts to learn. The gradient through the dynamics is misleading
+            while the model is wrong: an actor that starts with the model soon saturates. The reference has 0.
     """
 
     actor: str = "reinforce"
@@ -122,13 +122,13 @@ class DreamerV3Losses(LossConfig):
 
 @dataclass
 class LatentPPOLosses(LossConfig):
-    """And those of an actor that learns from what was collected.
+    """Settings of the losses of latent PPO, whose actor learns from collected rollouts.
 
     Attributes:
-        actor: Its objective: ``clipped``, or ``module:function`` of your own.
-        critic: What the critic that teaches the actor sees: ``latent``, the world model's latents, or ``state``, the
-            simulator's state, which only training needs.
-        ppo: Numbers of the updates of both.
+        actor: Objective of the actor: ``clipped``, or your own ``module:function``.
+        critic: Input of PPO's critic: ``latent`` for the world model's latents, ``state`` for the simulator's state,
+            which is only needed in training.
+        ppo: Settings of the PPO updates of actor and critic.
     """
 
     actor: str = "clipped"

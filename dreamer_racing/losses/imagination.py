@@ -1,7 +1,7 @@
-"""Rollouts inside the world model: where they begin, and how they go.
+"""Imagined rollouts of the policy in the world model, and the choice of their starts.
 
-Shape legend: B batch, T time, N starts, H horizon, D belief, S state, F = D + S features, A action. Of rollouts time
-comes first here, so that a step is one block of memory.
+Shape legend: B batch, T time, N starts, H horizon, D belief, S state, F = D + S features, A action. Rollouts have time
+first, so that a step is one block of memory.
 """
 
 from __future__ import annotations
@@ -29,13 +29,13 @@ class Imagination(NamedTuple):
 
 
 class Starts(NamedTuple):
-    """Where imagination begins, without gradient.
+    """Records from which imagination starts, without gradient.
 
     Attributes:
         belief: ``(N, D)``.
         state: ``(N, S)``.
         terminated: Whether the episode ended there, bool ``(N, 1)``.
-        previous_action: That led there, ``(N, A)``.
+        previous_action: Action that led there, ``(N, A)``.
     """
 
     belief: Tensor
@@ -47,14 +47,14 @@ class Starts(NamedTuple):
 def choose_starts(
     belief: Tensor, state: Tensor, terminated: Tensor, previous_action: Tensor, number: int | None = None
 ) -> Starts:
-    """Choose among the latents of a batch those that imagination begins from.
+    """Choose the records of a batch from which imagination starts.
 
     Args:
-        belief: Of its records, ``(B, T, D)``.
+        belief: ``(B, T, D)``.
         state: ``(B, T, S)``.
         terminated: ``(B, T, 1)``.
         previous_action: ``(B, T, A)``.
-        number: Of random ones; None for all, in order.
+        number: Number of random records; None for all, in order.
     """
     starts = Starts(*(value.detach().flatten(0, 1) for value in (belief, state, terminated, previous_action)))
     if number is None:
@@ -67,13 +67,13 @@ def choose_starts(
 def imagine(rssm: RSSM, actor: Actor, belief: Tensor, state: Tensor, horizon: int) -> Imagination:
     """Let the policy act in the world model.
 
-    Call it under ``torch.no_grad()`` where nothing shall flow back through the rollout, as with REINFORCE.
+    Call it under ``torch.no_grad()`` if no gradient shall flow through the rollout, as with REINFORCE.
 
     Args:
         rssm: Dynamics.
         actor: Policy.
-        belief: Starts, ``(N, D)``.
-        state: Starts, ``(N, S)``.
+        belief: Belief of the starts, ``(N, D)``.
+        state: State of the starts, ``(N, S)``.
         horizon: H, number of actions.
 
     Returns:
@@ -91,9 +91,9 @@ def imagine(rssm: RSSM, actor: Actor, belief: Tensor, state: Tensor, horizon: in
 
 
 def _imagine_low(rssm: RSSM, actor: Actor, belief: Tensor, state: Tensor, horizon: int) -> Imagination:
-    """Let the policy act in the world model, with fewer kernels.
+    """Do the same as ``imagine`` without gradient, with fewer kernels.
 
-    Noise is drawn ahead. Features are in the type in which autocast computes, to which every head casts them first.
+    Noise is drawn in advance. Features have autocast's type, to which every head would cast them anyway.
     """
     shape = (horizon + 1, len(belief), belief.shape[-1] + state.shape[-1])
     features = belief.new_zeros(shape, dtype=autocast_type(belief.device.type) or belief.dtype)

@@ -1,11 +1,11 @@
-"""Objectives of the policy: pure functions of the steps that it took, imagined or collected.
+"""Objectives of the policy: pure functions of imagined or collected steps.
 
-An objective takes a `Trajectory` and numbers, and returns a loss, a scalar, with metrics, scalars by name:
+An objective takes a `Trajectory` and hyperparameters, and returns a scalar loss and scalar metrics by name:
 
     def objective(trajectory, **numbers): return loss, {"name": metric}
 
-Shape legend: H steps and N rollouts side by side, or of a shuffled minibatch one dimension M in place of both; F
-features, A action.
+Shape legend: H steps, N parallel rollouts (a shuffled minibatch has one dimension M in place of both), F features, A
+action.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from dreamer_racing.settings import import_own, suggestion
 
 @contextmanager
 def frozen(*modules: nn.Module) -> Iterator[None]:
-    """Let gradient flow through modules but not into their parameters, nor what stands for these (``cast_once``)."""
+    """Let gradients flow through modules, but not into their parameters or the copies of these by ``cast_once``."""
     layers = {layer: None for module in modules for layer in module.modules()}
     held = [
         (layer, name, parameter)
@@ -44,19 +44,19 @@ def frozen(*modules: nn.Module) -> Iterator[None]:
 
 @dataclass(frozen=True)
 class Trajectory:
-    """Steps that a policy took, and what came of them; each ``(H, N, ...)``, or ``(M, ...)`` of a minibatch.
+    """Steps of a policy with their returns; each field ``(H, N, ...)``, or ``(M, ...)`` for a minibatch.
 
     Attributes:
-        policy: The present policy at each step; its mean and standard deviation ``(H, N, A)`` carry the gradient.
-        features: Belief and state that it saw, ``(H, N, F)``; without gradient.
-        action: Taken there, ``(H, N, A)``: imagined ones are not clipped, collected ones are, to [−1, 1].
-        previous_action: That led there, ``(H, N, A)``, clipped; zero where an episode begins.
-        behavior: The policy that took the action; of imagined steps the present one, without gradient.
-        lambda_return: From the step on, ``(H, N, 1)``; carries gradient where it comes through the dynamics.
-        value: Expected there, ``(H, N, 1)``.
-        advantage: λ-return less value, ``(H, N, 1)``: of imagined steps in units of ``scale``, of collected ones with
-            mean 0 and standard deviation 1.
-        weight: What a step counts for, ``(H, N, 1)``: the discounted probability of getting there.
+        policy: Current policy at each step; its mean and standard deviation ``(H, N, A)`` carry gradient.
+        features: Belief and state before the action, ``(H, N, F)``; without gradient.
+        action: Action taken, ``(H, N, A)``: unclipped if imagined, clipped to [−1, 1] if collected.
+        previous_action: Action of the step before, ``(H, N, A)``, clipped; zero at the start of an episode.
+        behavior: Policy that took the action; for imagined steps the current one, without gradient.
+        lambda_return: λ-return from the step on, ``(H, N, 1)``; carries gradient only if it flows through the dynamics.
+        value: Critic's value, ``(H, N, 1)``.
+        advantage: λ-return minus value, ``(H, N, 1)``: divided by ``scale`` for imagined steps, normalised to mean 0
+            and standard deviation 1 for collected ones.
+        weight: Weight of each step, ``(H, N, 1)``: discounted probability of reaching it if imagined, 1 if collected.
         scale: Range of the returns, at least 1, a scalar.
     """
 
@@ -72,14 +72,14 @@ class Trajectory:
     scale: Tensor
 
     def mean(self, values: Tensor) -> Tensor:
-        """Return the mean over the steps ``(H, N, 1)``, by what they count for, a scalar."""
+        """Return the mean of ``weight`` times values ``(H, N, 1)`` over the steps, a scalar."""
         return (self.weight * values).mean()
 
     def action_change(self) -> Tensor:
-        """Return the mean square ‖μₜ − μₜ₋₁‖² by which the policy's mean changes from step to step, a scalar.
+        """Return the weighted mean of ‖μₜ − μₜ₋₁‖², the squared change of the policy's mean per step, a scalar.
 
-        For steps in order, ``(H, N, ...)``; the first, which follows none here, counts 0. It is of means, not of
-        samples: noise shall not be held on to.
+        The steps must be in order, ``(H, N, ...)``; the first one counts 0. The change is that of means, not of
+        samples, so that it does not reward repeating the noise.
 
         Reference: Mysore et al. 2021, "Regularizing action policies for smooth control with reinforcement learning",
         temporal smoothness; squared here, as changes of action are in the reward (b₃).
@@ -90,18 +90,18 @@ class Trajectory:
 
 
 Objective = Callable[..., tuple[Tensor, dict[str, Tensor]]]
-"""What a policy minimises: ``(trajectory, **numbers)`` to a loss and metrics of it, scalars."""
+"""Loss function of a policy: ``(trajectory, **numbers)`` to a loss and metrics, scalars."""
 Function = TypeVar("Function", bound=Callable)
 
 
 def through_dynamics(objective: Function) -> Function:
-    """Mark an objective that needs the gradient of returns through the imagined dynamics."""
+    """Mark an objective that needs the returns' gradient through the imagined dynamics."""
     objective.through_dynamics = True  # type: ignore[attr-defined]  # functions take attributes
     return objective
 
 
 def reinforce(trajectory: Trajectory, *, entropy_scale: Tensor, **numbers: Any) -> tuple[Tensor, dict[str, Tensor]]:
-    """Reinforce the actions that did better than the critic expected.
+    """Compute the REINFORCE loss: make actions with a positive advantage more likely.
 
     ``−weight · (log π(a) · advantage + entropy_scale · H[π])``, without gradient through the advantage.
 
@@ -114,7 +114,7 @@ def reinforce(trajectory: Trajectory, *, entropy_scale: Tensor, **numbers: Any) 
 
 @through_dynamics
 def dynamics(trajectory: Trajectory, *, entropy_scale: Tensor, **numbers: Any) -> tuple[Tensor, dict[str, Tensor]]:
-    """Climb the gradient of the λ-returns through the imagined dynamics.
+    """Compute the loss that maximises λ-returns by their gradient through the imagined dynamics.
 
     ``−weight · (λ-return / scale + entropy_scale · H[π])``: straight-through samples carry the gradient from rewards
     and values back to the actions.
@@ -130,10 +130,10 @@ def dynamics(trajectory: Trajectory, *, entropy_scale: Tensor, **numbers: Any) -
 def clipped_surrogate(
     trajectory: Trajectory, *, entropy_scale: Tensor, clip_epsilon: float, **numbers: Any
 ) -> tuple[Tensor, dict[str, Tensor]]:
-    """Make better actions likelier and worse ones less so, as far as the ratio to the policy that took them allows.
+    """Compute PPO's clipped surrogate loss.
 
-    ``−weight · (min(r·advantage, clip(r, 1 ± ε)·advantage) + entropy_scale · H[π])``, where r is the ratio of new to
-    old probability of the clipped action.
+    ``−weight · (min(r·advantage, clip(r, 1 ± ε)·advantage) + entropy_scale · H[π])``, where r is the ratio of the
+    clipped action's probabilities under the current and the behaviour policy.
 
     Reference: Schulman et al. 2017, "Proximal policy optimization algorithms", Eq. 7.
     """
@@ -146,25 +146,25 @@ def clipped_surrogate(
 
 
 def policy_drift(actor: nn.Module, before: Tensor, after: Tensor, weight: Tensor) -> Tensor:
-    """Measure how far the policy moves because the world model's latents do; trains the world model, not the actor.
+    """Compute how much the policy changes because the world model's latents do; trains the world model, not the actor.
 
-    To an actor that has become precise, latents that move are another policy: by a nat and more between two visits of
-    a record. What is minimised is the divergence of the policy at a record's latents as the model makes them now from
-    the policy at those that were stored, so that they may move wherever the actor does not look. Latents that are drawn
-    differ by the draw already: it is for those that are not.
+    As the world model learns, the latents of a record change, and with them the policy there: for an actor with small
+    standard deviations by a nat and more between two visits of a record. The loss is KL(stored ‖ current) of the policy
+    at a record's stored and current latents, so the latents may still change in directions that the actor ignores. It
+    is meant for deterministic latents, because sampled ones differ by their noise anyway.
 
     Args:
         actor: The policy.
         before: Features of the stored latents, ``(..., F)``.
-        after: Of the model's own, which carry gradient, ``(..., F)``.
-        weight: What a record counts for, ``(..., 1)``.
+        after: Features of the current latents, which carry gradient, ``(..., F)``.
+        weight: Weight of each record, ``(..., 1)``.
 
     Returns:
-        The divergence, nats, a scalar: the weighted mean over all records, as every loss is, so that several processes
-        average to the joint batch's.
+        The divergence, nats, a scalar: the sum of weighted divergences divided by the number of records, so that the
+        average over processes is that of the joint batch.
 
-    Reference: Cobbe et al. 2021, "Phasic policy gradient", the cloning term of Eq. 4; there the policy's own network
-    moves, too.
+    Reference: Cobbe et al. 2021, "Phasic policy gradient", the cloning term of Eq. 4, where the policy's own network
+    changes, too.
     """
     with torch.no_grad():
         old = actor(before)
@@ -174,7 +174,7 @@ def policy_drift(actor: nn.Module, before: Tensor, after: Tensor, weight: Tensor
 
 
 def normalized(advantage: Tensor, weight: Tensor) -> Tensor:
-    """Return advantages ``(..., 1)`` with mean 0 and deviation 1, over all processes, under weights ``(..., 1)``."""
+    """Normalise advantages ``(..., 1)`` to weighted mean 0 and standard deviation 1 over all processes."""
     share = weight / parallel.total(weight.sum()).clamp_min(1e-8)
     mean = parallel.total((share * advantage).sum())
     deviation = parallel.total((share * (advantage - mean).square()).sum()).sqrt()
@@ -182,11 +182,11 @@ def normalized(advantage: Tensor, weight: Tensor) -> Tensor:
 
 
 def gradient_of_actions(objective: Objective, *others: nn.Module) -> AbstractContextManager:
-    """Return the context in which a rollout is imagined for an objective.
+    """Return the gradient context in which a rollout is imagined for an objective.
 
     Args:
-        objective: Without the mark of `through_dynamics` nothing flows back through the rollout.
-        others: Networks that gradient may flow through, but not into.
+        objective: Unless it is marked by `through_dynamics`, the context is ``torch.no_grad()``.
+        others: Networks that gradients may flow through, but not into their parameters.
     """
     return frozen(*others) if getattr(objective, "through_dynamics", False) else torch.no_grad()
 
@@ -194,7 +194,7 @@ def gradient_of_actions(objective: Objective, *others: nn.Module) -> AbstractCon
 OBJECTIVES: dict[str, Objective] = {"reinforce": reinforce, "dynamics": dynamics, "clipped": clipped_surrogate}
 """Objectives by their names."""
 OF_COLLECTED = ("clipped",)
-"""Those of collected steps; the others are of imagined ones."""
+"""Objectives of collected steps; the others are of imagined steps."""
 
 GONE = {
     "ppo": "PPO learns from what was collected, by the algorithm latent_ppo",
@@ -202,19 +202,19 @@ GONE = {
     "latent_ppo": "it is an algorithm of its own now, recipes/latent_ppo.py loss.critic=latent",
     "asymmetric_ppo": "it is an algorithm of its own now, recipes/latent_ppo.py loss.critic=state",
 }
-"""Actors that there were, and what there is instead."""
+"""Names of removed objectives, and what replaces them."""
 
 
 def find_objective(name: str, collected: bool | None = None) -> Objective:
-    """Return the objective of a name, or one of your own, given as ``module:function``.
+    """Return an objective by its name, or import your own, given as ``module:function``.
 
     Args:
-        name: Of the objective.
-        collected: Whether it is to be of collected steps, or else of imagined ones; None: of either.
+        name: Name of the objective.
+        collected: Whether it must be an objective of collected (True) or imagined (False) steps; None accepts both.
 
     Raises:
-        ValueError: If there is none, or it is of the other steps; the message lists those that there are, or says where
-            a module was looked for, or which algorithm takes it.
+        ValueError: If there is no such objective, or it needs the other kind of steps; the message lists the known
+            ones, says where the module was searched, or which algorithm uses it.
     """
     if ":" in name:
         found = import_own(name, f"Objective {name!r}")

@@ -1,6 +1,6 @@
-"""λ-returns of rollouts and of replayed windows, and what a critic learns of them.
+"""λ-returns of rollouts and of replayed windows, and the critic's losses on them.
 
-Shape legend: B batch, T time, N starts, H horizon or steps of a rollout, F features. Of rollouts time comes first.
+Shape legend: B batch, T time, N starts, H horizon or steps of a rollout, F features, K bins. Rollouts have time first.
 """
 
 from __future__ import annotations
@@ -18,9 +18,9 @@ def lambda_return(reward: Tensor, next_value: Tensor, discount: Tensor, lambda_:
     ``G_t = reward_t + discount_t · ((1 − λ_t) · next_value_t + λ_t · G_{t+1})``, and ``G_H = next_value_{H−1}``.
 
     Args:
-        reward: Received on leaving step t, ``(H, ...)``.
-        next_value: Value of where step t leads, ``(H, ...)``.
-        discount: γ times the continuation of where step t leads, ``(H, ...)``.
+        reward: Reward for the action of step t, ``(H, ...)``.
+        next_value: Value of the state that step t leads to, ``(H, ...)``.
+        discount: γ times the probability that the episode continues there, ``(H, ...)``.
         lambda_: λ, one number or ``(H, ...)``.
 
     Returns:
@@ -29,7 +29,7 @@ def lambda_return(reward: Tensor, next_value: Tensor, discount: Tensor, lambda_:
     Reference: DreamerV3, Eq. 7.
     """
     carried = discount * lambda_
-    # reward + discount · (1 − λ) · next_value, of all steps at once
+    # reward + discount · (1 − λ) · next_value, for all steps at once
     intermediate = torch.addcmul(reward, discount - carried, next_value)
     current, returns = next_value[-1], []
     for step, factor in zip(reversed(intermediate.unbind(0)), reversed(carried.unbind(0)), strict=True):
@@ -48,10 +48,10 @@ def replay_return(
     discount: float | Tensor,
     lambda_: float,
 ) -> tuple[Tensor, Tensor]:
-    """Compute λ-returns along windows that may hold several episodes.
+    """Compute λ-returns along windows that may contain several episodes.
 
-    The return at record t uses the reward received on arriving at t + 1. Nothing crosses an episode's end: the return
-    at a terminated record is 0, and that at any other last record is its bootstrap, as at the window's end.
+    The return at record t starts with the reward received on arriving at t + 1. It never crosses an episode's end: the
+    return at a terminated record is 0; at any other last record of an episode or window it is the bootstrap value.
 
     Args:
         reward: Received on arriving at each record, ``(B, T, 1)``.
@@ -63,13 +63,13 @@ def replay_return(
         lambda_: λ.
 
     Returns:
-        Returns ``(B, T, 1)``, and weights ``(B, T, 1)``: 0 at records whose return is only their bootstrap, else 1.
+        Returns ``(B, T, 1)``, and weights ``(B, T, 1)``: 0 for records whose return is only their bootstrap, else 1.
     """
     followed_by_init = torch.cat((is_init[:, 1:], torch.ones_like(is_init[:, :1])), 1)
     last = followed_by_init | terminated | truncated
     value = bootstrap.masked_fill(terminated, 0.0)
-    # With λ = 0 on arriving at a last record, the return stops there; the discount stays γ, as its value is 0 if it
-    # was terminated. Time first: (T - 1, B, 1).
+    # λ = 0 on arriving at a last record ends the return there; the discount can stay γ, because the value of a
+    # terminated record is 0. Time first: (T - 1, B, 1).
     kept = lambda_ * (~last[:, 1:]).float()
     steps = lambda_return(
         reward[:, 1:].transpose(0, 1),
@@ -85,16 +85,16 @@ def replay_return(
 def rollout_return(
     reward: Tensor, value: Tensor, done: Tensor, terminated: Tensor, discount: Tensor, lambda_: float
 ) -> Tensor:
-    """Compute λ-returns along rollouts of an environment that may hold several episodes, time first.
+    """Compute λ-returns along rollouts of an environment that may contain several episodes, time first.
 
-    What comes after a step at which time ran out, or after the last step, was not seen: the value of the step itself
-    stands for it.
+    The observation after a truncated step or after the rollout's last step has no value: the step's own value is used
+    in its place.
 
     Args:
-        reward: Received on leaving each step, ``(T, N, 1)``.
-        value: Of each step, ``(T, N, 1)``.
+        reward: Reward for the action of each step, ``(T, N, 1)``.
+        value: Value of each step, ``(T, N, 1)``.
         done: Whether the episode ended there, bool ``(T, N, 1)``.
-        terminated: Whether nothing follows, bool ``(T, N, 1)``.
+        terminated: Whether it ended by termination, not by truncation, bool ``(T, N, 1)``.
         discount: γ, a scalar.
         lambda_: λ.
 
@@ -106,13 +106,13 @@ def rollout_return(
 
 
 def critic_loss(critic: Critic, features: Tensor, returns: Tensor, slow_scale: float) -> tuple[Tensor, Tensor]:
-    """Compute the regression of the critic on returns, and on the slow copy's mean.
+    """Compute the critic's two-hot regression loss on returns and on the value of its slow copy.
 
     Args:
         critic: The module to train.
         features: ``(..., F)``.
         returns: ``(..., 1)``.
-        slow_scale: Weight of the slow copy.
+        slow_scale: Weight of the regression on the slow copy.
 
     Returns:
         The loss ``(..., 1)``, and the critic's logits ``(..., K)``.
@@ -132,15 +132,15 @@ def replay_critic_loss(
     slow_scale: float,
     bootstrap: Tensor | None = None,
 ) -> Tensor:
-    """Compute the regression of the critic on λ-returns of replayed windows, a scalar.
+    """Compute the critic's regression loss on λ-returns of replayed windows, a scalar.
 
     Args:
         critic: The module to train.
-        features: Of the records, ``(B, T, F)``; if they carry a graph, the loss trains the world model, too.
+        features: Features of the records, ``(B, T, F)``; if they carry gradient, the loss also trains the world model.
         batch: Records ``[B, T]``: ``reward``, ``is_init``, ``terminated``, ``truncated``.
         discount: γ, a scalar.
         lambda_: λ.
-        slow_scale: Weight of the slow copy.
+        slow_scale: Weight of the regression on the slow copy.
         bootstrap: Values of the records, ``(B, T, 1)``; None for the critic's own.
     """
     logits = critic(features)
@@ -152,7 +152,7 @@ def replay_critic_loss(
 
 
 def _regression(critic: Critic, features: Tensor, logits: Tensor, returns: Tensor, slow_scale: float) -> Tensor:
-    """Return the loss of logits ``(..., K)`` on returns and on the slow value, ``(..., 1)``."""
+    """Return the loss of logits ``(..., K)`` on returns and on the slow copy's value, ``(..., 1)``."""
     two_hot, log_probabilities = critic.two_hot, logits.log_softmax(-1)
     slow_value = critic.slow_value(features)
     loss = two_hot.cross_entropy(log_probabilities, returns)

@@ -1,9 +1,9 @@
-"""World-model loss: reward, continuation, dynamics and representation, and targets.
+"""World-model loss: reward, continuation, dynamics, representation and targets.
 
-Targets are what shapes the latents beside rewards: images, numbers, the simulator's state, or the encoder itself.
+Targets shape the latents besides rewards: images, vectors, the simulator's state, or the encoder's embedding.
 
-Shape legend: B batch, T time, L latents, K classes, D belief, S state, F = D + S features, E embedding, P privileged
-numbers, M = B·T records.
+Shape legend: B batch, T time, L latents, K classes, D belief, S state, F = D + S features, E embedding, P width of the
+privileged vector, M = B·T records.
 """
 
 from __future__ import annotations
@@ -26,11 +26,11 @@ from dreamer_racing.modules.world_model import WorldModel
 from dreamer_racing.settings import import_own, suggestion
 
 OPEN_LOOP_STARTS = 64
-"""N, records of a batch from which rewards and ends are predicted ahead: this project's choice, for its time."""
+"""N, records of a batch from which `open_loop_loss` predicts; this project's choice, which limits its time."""
 
 
 class Latents(NamedTuple):
-    """What the world model has inferred of a batch ``[B, T]``, with its graph.
+    """Latents that the world model inferred for a batch ``[B, T]``, with gradient.
 
     Attributes:
         belief: ``(B, T, D)``.
@@ -42,27 +42,26 @@ class Latents(NamedTuple):
 
     @property
     def features(self) -> Tensor:
-        """Both, ``(B, T, F)``."""
+        """Belief and state side by side, ``(B, T, F)``."""
         return join_features(self.belief, self.state)
 
 
 class WorldModelLoss(nn.Module):
-    """Reward and continuation losses, the dynamics and representation losses, and those of targets.
+    """Losses of reward, continuation, dynamics, representation and targets.
 
-    Targets are what shapes the latents beside rewards; parameters that one owns are trained, saved and restored with
-    those of the networks.
+    Parameters of targets are trained, saved and restored with those of the networks.
 
     Args:
-        agent: Whose world model is trained.
-        config: Which targets (``world_model``), and numbers: ``dynamics_scale`` of KL(sg(posterior) ‖ prior),
+        agent: Agent whose world model is trained.
+        config: Names of the targets (``world_model``), and weights: ``dynamics_scale`` of KL(sg(posterior) ‖ prior),
             ``representation_scale`` of KL(posterior ‖ sg(prior)), ``free_nats``.
 
     Attributes:
-        in_keys: What is read of a batch.
-        targets: By their classes' names.
+        in_keys: Keys of a batch that are read.
+        targets: Targets by the names of their classes.
 
     Raises:
-        ValueError: If a target is not known, or lacks what it needs.
+        ValueError: If a target is unknown, or lacks something that it needs.
 
     Reference: DreamerV3, Eq. 4-5.
     """
@@ -85,12 +84,12 @@ class WorldModelLoss(nn.Module):
         """Compute the losses of a batch, and infer its latents.
 
         Args:
-            batch: Records ``[B, T]``: what the encoder and the targets see, ``previous_action``, ``reward``,
-                ``is_init``, ``terminated``, and ``context``, from whose first record windows go on where it is there.
+            batch: Records ``[B, T]``: inputs of the encoder and the targets, ``previous_action``, ``reward``,
+                ``is_init``, ``terminated``, and optionally ``context``, the stored latents from which windows start.
 
         Returns:
             Scalars: ``loss_reward``, ``loss_continue``, ``loss_dynamics``, ``loss_representation``, ``reward_error``,
-            ``kl`` (nats) and what the targets write; and the latents.
+            ``kl`` (nats) and those of the targets; and the latents.
 
         Raises:
             KeyError: If the batch lacks a key.
@@ -98,19 +97,19 @@ class WorldModelLoss(nn.Module):
         require_keys(batch, self.in_keys)
         model, rssm, stored = self.world_model, self.world_model.rssm, batch.get(CONTEXT, None)
 
-        # Infer the latents of the records, from where windows begin.
+        # Infer the latents of the records, starting from those stored with each window's first record, if any.
         embedding = model.encoder(batch)
         initial = None if stored is None else rssm.latent_format.unpack(stored[:, 0])
         is_init = batch.get("is_init").squeeze(-1)
         posterior = rssm.observe(embedding, batch.get("previous_action"), is_init, initial=initial)
         features = join_features(posterior.belief, posterior.state)
 
-        # Targets: what the latents must tell beside rewards.
+        # Targets: what the latents must encode besides rewards.
         losses: dict[str, Tensor] = {}
         for target in self.targets.values():
             losses |= target(posterior, features, embedding, batch)
 
-        # Rewards received on arriving at each record, and whether the episode goes on there.
+        # Rewards received on arriving at each record, and whether the episode continues there.
         reward, goes_on, head = batch.get("reward"), 1.0 - batch.get("terminated").float(), model.reward_head
         logits = head(features)
         with torch.no_grad():
@@ -119,7 +118,7 @@ class WorldModelLoss(nn.Module):
         losses["loss_continue"] = F.binary_cross_entropy_with_logits(model.continue_head(features), goes_on)
         losses["reward_error"] = reward_error
 
-        # Dynamics: predict the latents before the observation is seen, and let observations tell what is predictable.
+        # Dynamics: train the prior to predict the posterior; representation: keep the posterior predictable.
         dynamics, representation, kl = kl_losses(
             posterior.posterior_logits, posterior.prior_logits, self.config.free_nats, rssm.unimix
         )
@@ -130,14 +129,14 @@ class WorldModelLoss(nn.Module):
 
 
 def open_loop_loss(model: WorldModel, latents: Latents, batch: TensorDictBase, steps: int) -> Tensor:
-    """Compute the loss of rewards and ends predicted steps ahead, from replayed actions alone.
+    """Compute the loss of rewards and episode ends that are predicted over K steps from replayed actions alone.
 
-    Imagination reads the heads at latents that no observation has corrected. Heads that are trained at corrected ones
-    alone do not know how unsure the others are, and underrate crashes (docs/learning.md).
+    Imagination evaluates the heads at predicted latents. Heads that are only trained at latents inferred from
+    observations do not account for the uncertainty of predicted ones, and underestimate crashes (docs/learning.md).
 
     Args:
-        model: Whose dynamics and heads learn, and that made the latents.
-        latents: Inferred of the batch, with their graph.
+        model: World model that inferred the latents; its dynamics and heads learn.
+        latents: Latents of the batch, with gradient.
         batch: Records ``[B, T]``: ``previous_action``, ``reward``, ``terminated``, ``is_init``.
         steps: K, at least 1 and less than T.
 
@@ -147,9 +146,10 @@ def open_loop_loss(model: WorldModel, latents: Latents, batch: TensorDictBase, s
     Raises:
         ValueError: If the windows are too short.
 
-    Reference: Hafner et al. 2019, "Learning latent dynamics for planning from pixels", latent overshooting, of heads.
+    Reference: Hafner et al. 2019, "Learning latent dynamics for planning from pixels", latent overshooting; here for
+    the heads.
     """
-    starts = batch.shape[1] - steps  # of a window
+    starts = batch.shape[1] - steps  # in each window
     if starts < 1:
         raise ValueError(
             f"open_loop_steps={steps} must be less than the {batch.shape[1]} records of a window (batch_length)."
@@ -173,7 +173,7 @@ def open_loop_loss(model: WorldModel, latents: Latents, batch: TensorDictBase, s
 def kl_losses(
     posterior_logits: Tensor, prior_logits: Tensor, free_nats: float, unimix: float
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Compute the two KL losses between posterior and prior; free nats apply to the sum over latents.
+    """Compute the two KL losses between posterior and prior; free nats apply to the KL summed over latents.
 
     Args:
         posterior_logits: ``(..., L, K)``.
@@ -199,10 +199,10 @@ def kl_losses(
 
 
 def require_keys(batch: TensorDictBase, keys: list[NestedKey]) -> None:
-    """Refuse a batch that lacks something.
+    """Check that a batch has all keys.
 
     Raises:
-        KeyError: If a key is missing; the message names it, and what there is.
+        KeyError: If a key is missing; the message lists the missing and the existing ones.
     """
     missing = [key for key in keys if batch.get(key, None) is None]
     if missing:
@@ -211,19 +211,19 @@ def require_keys(batch: TensorDictBase, keys: list[NestedKey]) -> None:
 
 
 class Target(nn.Module):
-    """Something that the latents must tell, and its loss.
+    """Loss on something that the latents must encode; base class of targets.
 
     Modules that a target makes are trained, saved and restored with the networks.
 
     Args:
         agent: The networks; a target may use any of the world model's.
-        config: Numbers of the losses.
+        config: Settings of the losses.
 
     Attributes:
-        world_model: Of the agent.
+        world_model: World model of the agent.
         config: As given.
-        decodes: Whether the world model must have decoders of what is seen.
-        reads: Keys of the batch that it needs, beside what the encoder sees.
+        decodes: Whether the world model must have decoders of the observations.
+        reads: Keys of the batch that it needs, besides those of the encoder.
     """
 
     decodes: ClassVar[bool] = False
@@ -242,19 +242,18 @@ class Target(nn.Module):
         Args:
             posterior: Latents of the batch, and their distributions.
             features: Belief and state side by side, ``(B, T, F)``.
-            embedding: What the encoder made of the observations, ``(B, T, E)``.
+            embedding: Encoded observations, ``(B, T, E)``.
             batch: The records ``[B, T]``.
         """
         raise NotImplementedError(f"{type(self).__name__} must say what it minimises.")
 
 
 class Image(Target):
-    """Reconstruct the images that the agent sees, if it does: DreamerV3.
+    """Target of DreamerV3: reconstructs the images that the agent sees, if any.
 
-    Writes ``loss_image`` (squared error summed over an image's pixels, values in [0, 1], by ``image_scale``) and
-    ``image_error`` (mean squared error of a pixel). With ``image_share`` below 1 so many of a window's records, at
-    least one, are decoded where gradients are wanted: those of the same random places in all windows, drawn anew in
-    every call.
+    Writes ``loss_image`` (squared error summed over an image's pixels, values in [0, 1], times ``image_scale``) and
+    ``image_error`` (mean squared error per pixel). With ``image_share`` below 1 and gradients enabled, only that share
+    of each window's records is decoded, at least one: the same random positions in all windows, new ones in each call.
     """
 
     decodes = True
@@ -262,7 +261,7 @@ class Image(Target):
     def forward(
         self, posterior: Posterior, features: Tensor, embedding: Tensor, batch: TensorDictBase
     ) -> dict[str, Tensor]:
-        """Return the images' loss."""
+        """Return the loss of the images."""
         if self.world_model.decoder is None:
             return {}
         belief, state, pixels = self._share_of_records(posterior.belief, posterior.state, batch.get(PIXELS))
@@ -272,7 +271,7 @@ class Image(Target):
         return {"loss_image": image, "image_error": error.detach()}
 
     def _share_of_records(self, *values: Tensor) -> tuple[Tensor, ...]:
-        """Return each ``(B, T, ...)`` at ``image_share`` of its T records; whole, where it is only measured."""
+        """Return ``image_share`` of the T records of each tensor ``(B, T, ...)``; all of them without gradients."""
         share = self.config.image_share
         if share == 1 or not torch.is_grad_enabled():
             return values
@@ -282,14 +281,14 @@ class Image(Target):
 
 
 class Vector(Target):
-    """Reconstruct the numbers that the agent sees, if it does: ``loss_vector``, squared error of symlogs, summed."""
+    """Target that reconstructs the vector that the agent sees, if any: ``loss_vector``, summed squared symlog error."""
 
     decodes = True
 
     def forward(
         self, posterior: Posterior, features: Tensor, embedding: Tensor, batch: TensorDictBase
     ) -> dict[str, Tensor]:
-        """Return the numbers' loss."""
+        """Return the loss of the vector."""
         if self.world_model.vector_decoder is None:
             return {}
         numbers = batch.get(self.world_model.interface.vector_key)
@@ -297,16 +296,16 @@ class Vector(Target):
 
 
 class State(Target):
-    """Decode the simulator's state, which neither policy nor world model sees.
+    """Target that decodes the simulator's state, which neither policy nor world model sees.
 
-    Writes ``loss_privileged`` (squared error of symlogs, summed over P, by ``privileged_scale``) and
-    ``privileged_error`` (the same, unscaled mean over P). Without images an update takes about a third less time.
+    Writes ``loss_privileged`` (squared error of symlogs, summed over P, times ``privileged_scale``) and
+    ``privileged_error`` (mean over P, unscaled). Without images an update takes about a third less time.
 
     Attributes:
-        decoder: Of the state; no part of the world model.
+        decoder: Decoder of the state; not part of the world model.
 
     Raises:
-        ValueError: If the environment gives no privileged numbers.
+        ValueError: If the environment gives no privileged vector.
 
     Reference: Lambrechts et al. 2023, "Informed POMDP"; SkyDreamer decodes the state in place of images.
     """
@@ -326,7 +325,7 @@ class State(Target):
     def forward(
         self, posterior: Posterior, features: Tensor, embedding: Tensor, batch: TensorDictBase
     ) -> dict[str, Tensor]:
-        """Return the state's loss."""
+        """Return the loss of the state."""
         target = batch.get(PRIVILEGED)
         error = self.decoder.squared_error(features, target)
         return {
@@ -336,11 +335,11 @@ class State(Target):
 
 
 class Barlow(Target):
-    """Make the latents agree with the encoder's embedding, without redundancy between dimensions, and decode nothing.
+    """Target that correlates the latents with the encoder's embedding by Barlow Twins, without a decoder.
 
-    A linear projection of belief and state is correlated with the embedding of the same record. The embedding is a
-    fixed target: the encoder learns through the posterior. Writes ``loss_barlow``, by ``barlow_scale``, and
-    ``agreement``, the mean correlation of matching dimensions, 1 at best.
+    A linear projection of belief and state is correlated with the embedding of the same record, and redundancy between
+    dimensions is penalised. The embedding is detached: the encoder learns through the posterior. Writes
+    ``loss_barlow``, times ``barlow_scale``, and ``agreement``, the mean correlation of matching dimensions, at most 1.
 
     Reference: R2-Dreamer (decoder-free, redundancy reduction between projected latents and image embeddings);
     Zbontar et al. 2021, "Barlow Twins".
@@ -393,18 +392,17 @@ TARGETS: dict[str, tuple[type[Target], ...]] = {
     "decoder_free": (Barlow,),
     "reward_only": (),
 }
-"""What shapes the latents beside rewards, by the names that ``LossConfig.world_model`` may have."""
+"""Targets by the names that ``LossConfig.world_model`` may have."""
 
 
 def find_targets(names: str) -> tuple[type[Target], ...]:
-    """Return the targets of a row of `TARGETS`, and of ``module:Class`` of your own; several are joined by ``+``.
+    """Return targets by their names in `TARGETS` or as your own ``module:Class``; several are joined by ``+``.
 
     Args:
         names: For example ``reconstruction``, ``my_targets:Mine`` or ``privileged+my_targets:Mine``.
 
     Raises:
-        ValueError: If there is none of a name; the message lists those that there are, or says where a module was
-            looked for.
+        ValueError: If a name is unknown; the message lists the known ones, or says where the module was searched.
     """
     found: list[type[Target]] = []
     for name in names.split("+"):

@@ -1,4 +1,4 @@
-"""The agent's networks; plain tensors inside, TensorDict only in `DreamerPolicy` and `LatentFormat`."""
+"""Networks of the agent, on plain tensors; only `DreamerPolicy` and `LatentFormat` use TensorDict."""
 
 import dreamer_racing.envs  # noqa: F401 - heeds MUJOCO_GL before TorchRL imports MuJoCo
 from dreamer_racing.modules.agent import Agent, DreamerPolicy

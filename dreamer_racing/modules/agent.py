@@ -1,4 +1,4 @@
-"""The agent: the three networks that are trained together, and their acting step as a TensorDictModule.
+"""The agent, which is world model, actor and critic, and its policy as a TensorDictModule.
 
 Shape legend: N environments, A action, D belief, S state.
 """
@@ -22,21 +22,21 @@ from dreamer_racing.modules.world_model import WorldModel
 
 
 class Agent(nn.Module):
-    """The three networks that are trained together.
+    """World model, actor and critic.
 
     Args:
-        size: Their widths.
-        interface: What the agent sees and does.
-        decode: Whether the world model has decoders of what is seen.
+        size: Sizes of the networks.
+        interface: Observations and actions of the agent.
+        decode: Whether the world model has decoders of the observations.
         min_std: Smallest standard deviation of actions.
-        max_std: Largest.
+        max_std: Largest standard deviation of actions.
 
     Attributes:
         size: As given.
         interface: As given.
-        world_model: Predicts.
-        actor: Acts.
-        critic: Judges; holds its slow copy.
+        world_model: Encoder, dynamics, decoders, reward and continue heads.
+        actor: Policy head.
+        critic: Value function with its slow copy.
     """
 
     def __init__(
@@ -57,20 +57,20 @@ class Agent(nn.Module):
 
 
 class DreamerPolicy(TensorDictModuleBase):
-    """Observe, update the latent, act.
+    """Recurrent policy that encodes the observation, updates the latents and chooses an action.
 
-    The recurrent keys are read at the root and written under ``"next"``, from where the environment's step carries
-    them to the next root; append ``make_primer()`` and ``InitTracker()`` to the environment so that they exist. Where
-    ``is_init``, what the root holds is ignored, so partial and automatic resets need nothing more.
+    The recurrent keys are read at the root and written under ``"next"``, from where the environment's step moves them
+    to the next root; append ``make_primer()`` and ``InitTracker()`` to the environment so that they exist. If
+    ``is_init`` is set, their values at the root are ignored, so partial and automatic resets need nothing more.
 
     Args:
-        world_model: Its encoder and RSSM are used (and shared, not copied).
+        world_model: World model whose encoder and RSSM are used (shared, not copied).
         actor: The policy head.
-        deterministic: Take the mode of the latents and the mean of clipped actions, no samples; may be set at any time.
+        deterministic: Use the mode of the latents and the mean of clipped actions, no samples; may be set at any time.
 
     | key | read / written | shape |
     |---|---|---|
-    | ``pixels``, ``vector`` | read, what of them the agent sees | uint8 (N, height, width, 3), float32 (N, V) |
+    | ``pixels``, ``vector`` or ``imu`` | read, if the agent sees them | uint8 (N, height, width, 3), float32 (N, V) |
     | ``is_init`` | read | bool (N, 1) |
     | ``belief``, ``state``, ``previous_action`` | read | (N, D), (N, S), (N, A) |
     | ``action`` | written | (N, A) in [−1, 1] |
@@ -104,16 +104,16 @@ class DreamerPolicy(TensorDictModuleBase):
         return tensordict
 
     def act(self, seen: Mapping[str, Tensor]) -> tuple[Tensor, Tensor, Tensor]:
-        """Return action (N, A), belief (N, D) and state (N, S), in plain tensors.
+        """Return action (N, A), belief (N, D) and state (N, S) as plain tensors.
 
         Args:
-            seen: What is read, by the keys and shapes of the table, with one batch dimension; ``is_init`` may be (N,).
+            seen: The keys that the table lists as read, with one batch dimension; ``is_init`` may be (N,).
         """
         return self._decide(seen)[1:]
 
     @torch.no_grad()
     def _decide(self, seen: Mapping[str, Tensor]) -> tuple[ActionDistribution, Tensor, Tensor, Tensor]:
-        """Return what ``act`` does, after the distribution of the action."""
+        """Return the distribution of the action, then action, belief and state as ``act`` does."""
         belief, state = self.rssm.observe_step(
             self.encoder(seen),
             seen["previous_action"],

@@ -1,6 +1,6 @@
-"""Encoders and decoders: what the agent sees to one flat embedding; belief and state to the mean of what is seen.
+"""Encoders from observations to one flat embedding, and decoders from belief and state to predicted observations.
 
-Shape legend: N any batch, C channels, V numbers, E embedding, F features, G blocks.
+Shape legend: N any batch, C channels, V vector, E embedding, F features, G blocks.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ from dreamer_racing.modules.sizes import ModelSize
 
 
 def smallest_map(image_size: int, patch: int, stages: int) -> int:
-    """Return the side of the map that is left of an image when its pixel blocks are folded and it is halved.
+    """Return the side of the last feature map of an image whose pixel blocks are folded and which is then halved.
 
     Args:
         image_size: Height and width of the image, pixels.
@@ -35,7 +35,7 @@ def smallest_map(image_size: int, patch: int, stages: int) -> int:
         stages: Number of halvings.
 
     Raises:
-        ValueError: If that does not come out even.
+        ValueError: If the image's size is not divisible by that.
     """
     step = patch * 2**stages
     if image_size < 1 or image_size % step:
@@ -73,9 +73,9 @@ def unfold_patches(maps: Tensor, patch: int) -> Tensor:
 
 
 def _centred(images: Tensor) -> Tensor:
-    """Map uint8 to [−0.5, 0.5], in float32, or where autocast computes in bfloat16, rounded to that."""
+    """Map uint8 to [−0.5, 0.5], in float32, or in bfloat16 under autocast."""
     if autocast_type(images.device.type) is torch.bfloat16:
-        # x − 127.5 is exact in its 8 bits, so that this rounds once, as the cast of float32 would.
+        # x − 127.5 is exact in bfloat16's 8 bits, so this rounds only once, like a cast from float32.
         return images.to(torch.bfloat16).sub_(127.5).mul_(1.0 / 255.0)
     return images.float().div_(255.0).sub_(0.5)
 
@@ -85,7 +85,7 @@ class ImageEncoder(nn.Module):
 
     Args:
         depth: Channels of a stage are ``depth * multiplier``.
-        multipliers: One per stage; each stage halves the image.
+        multipliers: One for each stage, which halves the image.
         kernel: Kernel size, pixels.
         strided: Halve by stride 2 rather than by a 2×2 max-pool; four times fewer FLOPs.
         norm: ``"rms"`` or ``"layer"``.
@@ -145,7 +145,7 @@ class ImageEncoder(nn.Module):
 
 
 class VectorEncoder(nn.Module):
-    """Hidden layers on the symlog of numbers.
+    """Encoder of vectors: hidden layers on their symlog.
 
     Args:
         inputs: V.
@@ -168,14 +168,14 @@ class VectorEncoder(nn.Module):
 
 
 class ObservationEncoder(nn.Module):
-    """Everything that the agent sees, each part by its own encoder, side by side.
+    """Encoder of all observations: the embeddings of the image and vector encoders side by side.
 
     Args:
-        size: Widths.
-        interface: What the agent sees.
+        size: Sizes of the networks.
+        interface: Observations of the agent.
 
     Attributes:
-        keys: What ``forward`` reads, images first.
+        keys: Keys that ``forward`` reads, images first.
         embedding_size: E.
     """
 
@@ -227,7 +227,7 @@ class DenseProjection(nn.Module):
 
 
 class BlockProjection(nn.Module):
-    """Block-diagonal layer for the belief, one channel group a block, plus two layers for the state (2025)."""
+    """Block-diagonal layer for the belief, one channel group per block, plus two layers for the state (2025)."""
 
     def __init__(
         self, belief: int, state: int, resolution: int, channels: int, blocks: int, units: int, norm: str
@@ -273,7 +273,7 @@ class StridedConvolution(nn.ConvTranspose2d):
 
 
 class ImageDecoder(nn.Module):
-    """Mirror of ``ImageEncoder``: a projection to the smallest map, then doublings up to the image.
+    """Image decoder, mirror of ``ImageEncoder``: a projection to the smallest map, then doublings up to the image.
 
     Args:
         belief: Width of h.
@@ -339,7 +339,7 @@ class ImageDecoder(nn.Module):
         return images.reshape(*belief.shape[:-1], self.image_size, self.image_size, 3)
 
     def squared_error(self, belief: Tensor, state: Tensor, pixels: Tensor) -> Tensor:
-        """Compare predicted images with true ones, in whatever order of pixels is cheapest.
+        """Compare predicted images with true ones, without unfolding the pixel blocks.
 
         Args:
             belief: ``(..., belief)``.
@@ -361,7 +361,7 @@ class ImageDecoder(nn.Module):
 
 
 class VectorDecoder(nn.Module):
-    """Hidden layers to the symlog of numbers.
+    """Decoder of vectors: hidden layers that predict their symlog.
 
     Args:
         features: F.
@@ -378,9 +378,9 @@ class VectorDecoder(nn.Module):
         self.mlp = MLP(features, outputs, layers, units, norm)
 
     def forward(self, features: Tensor) -> Tensor:
-        """Map features ``(..., F)`` to the numbers expected ``(..., V)``."""
+        """Map features ``(..., F)`` to the predicted vector ``(..., V)``."""
         return symexp(self.mlp(features).float())
 
     def squared_error(self, features: Tensor, vector: Tensor) -> Tensor:
-        """Compare with true numbers ``(..., V)``: squared error of symlogs, summed over V, mean over the rest."""
+        """Compare with a true vector ``(..., V)``: squared error of symlogs, summed over V, mean over the rest."""
         return (self.mlp(features).float() - symlog(vector)).square().sum(-1).mean()

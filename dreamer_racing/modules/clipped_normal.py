@@ -1,4 +1,4 @@
-"""Normal distributions of actions whose samples the race clips to [−1, 1].
+"""Normal distributions of actions whose samples the environment clips to [−1, 1].
 
 Shape legend: A action.
 """
@@ -12,14 +12,14 @@ from torch import Tensor
 
 
 def clipped_mean(mean: Tensor, std: Tensor) -> Tensor:
-    """Return the mean of what the race gets: of the samples of a normal, each clipped to [−1, 1].
+    """Return the mean of normal samples that are clipped to [−1, 1].
 
-    A policy whose samples are clipped may put its own mean far beyond a bound, where it tells little: noise keeps what
-    is flown below the bound. Clipped samples have their mean where the policy flies, and inside the bounds.
+    The mean of the unclipped normal may lie far beyond a bound, and then says little about the actions: even near a
+    bound, noise keeps the average clipped sample inside it. The clipped mean is the average action in training.
 
     Args:
-        mean: of the normal, ``(..., A)``.
-        std: its standard deviation, ``(..., A)`` or what goes with it, positive.
+        mean: Mean of the normal, ``(..., A)``.
+        std: Positive standard deviation, ``(..., A)`` or of a shape that broadcasts with it.
 
     Returns:
         ``(..., A)``, in [−1, 1].

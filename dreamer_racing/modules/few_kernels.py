@@ -1,10 +1,10 @@
-"""Fewer kernels where a loop over time makes them by the thousand: the same functions, rounded elsewhere.
+"""Ways to launch fewer kernels in loops over time: the same functions with different rounding.
 
-On a CUDA device a kernel takes some microseconds to launch, however little it does. What is here is chosen by the
-learner (`LearnerConfig.few_kernels`); on a CPU, where it gains nothing, results stay bit for bit what they were.
+On a CUDA device the launch of a kernel takes some microseconds, however little it computes. The learner turns these
+variants on (`LearnerConfig.few_kernels`); by default they are off on a CPU, where they gain nothing.
 
-Autocast casts a weight each time that a layer uses it: imagination alone makes a kernel for every weight in each of its
-steps. Here all weights are cast by one kernel, and their gradients back by another.
+Autocast casts a weight at every use: imagination alone launches one cast for every weight in each step. Here one kernel
+casts all weights, and another casts their gradients back.
 """
 
 from __future__ import annotations
@@ -21,11 +21,11 @@ from torch.autograd.function import FunctionCtx
 from dreamer_racing.modules.layers import BlockLinear, LayerNorm, RMSNorm
 
 LAYERS = (nn.Linear, nn.Conv2d, nn.ConvTranspose2d, BlockLinear, LayerNorm, RMSNorm)
-"""Those whose weights, biases and gains are cast; what else is learned stays in float32."""
+"""Layers whose weights, biases and gains are cast; all other parameters stay in float32."""
 
 
 def save_kernels(module: nn.Module) -> None:
-    """Let all parts of a module that know how to do with fewer kernels do so."""
+    """Turn on ``few_kernels`` in all submodules that have it."""
     for part in module.modules():
         if hasattr(part, "few_kernels"):
             part.few_kernels = True  # type: ignore[assignment]  # no tensor, nor a module
@@ -33,18 +33,18 @@ def save_kernels(module: nn.Module) -> None:
 
 @contextmanager
 def cast_once(module: nn.Module, dtype: torch.dtype) -> Iterator[None]:
-    """Let the layers of a module compute with copies of their parameters, through which gradients reach these.
+    """Make the layers of a module use casted copies of their parameters; gradients flow to the originals.
 
-    Where a parameter is used several times, its gradients are added up in the type of the copies.
+    If a parameter is used several times, its gradients are summed in the type of the copies.
 
     Args:
-        module: Under autocast, which then has nothing left to cast but activations.
-        dtype: Of the copies.
+        module: Module that runs under autocast, which then only has to cast activations.
+        dtype: Type of the copies.
     """
     layers = {layer: None for layer in module.modules() if isinstance(layer, LAYERS)}
     held = [(layer, name, p) for layer in layers for name, p in layer._parameters.items() if p is not None]
     copies = _Cast.apply(dtype, *(parameter for _, _, parameter in held))
-    # Not by assignment, which takes nothing but parameters in the place of a parameter.
+    # Not by attribute assignment, which accepts only parameters in place of a parameter.
     for (layer, name, _), copy in zip(held, copies, strict=True):
         layer._parameters[name] = copy
     try:
@@ -55,7 +55,7 @@ def cast_once(module: nn.Module, dtype: torch.dtype) -> Iterator[None]:
 
 
 class _Cast(Function):
-    """Casts many tensors by one kernel."""
+    """Casts many tensors with one kernel."""
 
     @staticmethod
     def forward(ctx: FunctionCtx, dtype: torch.dtype, *tensors: Tensor) -> tuple[Tensor, ...]:

@@ -1,4 +1,4 @@
-"""What reads the latents: prediction heads and the two-hot distribution, the critic with its slow copy, the actor.
+"""Heads on the latents: reward and continue heads, the two-hot distribution, the critic with its slow copy, the actor.
 
 Shape legend: N any batch, F features, K bins, A action.
 """
@@ -18,11 +18,11 @@ from dreamer_racing.modules.layers import NormedLinear, linear
 
 _LOG_SQRT_2PI = 0.5 * math.log(2 * math.pi)
 STD_SHIFT = 2.0
-"""What is added to the raw deviation, so that a fresh network's is large. Reference: ``heads.bounded_normal``."""
+"""Shift of the network's raw output for a large initial standard deviation. Reference: ``heads.bounded_normal``."""
 MIN_STD, MAX_STD = 0.1, 1.0
-"""Bounds of the deviation. Reference: danijar/dreamerv3, ``configs.yaml``."""
+"""Bounds of the standard deviation. Reference: danijar/dreamerv3, ``configs.yaml``."""
 FIRST_STD = 0.6
-"""Deviation to begin with where it does not depend on the state, as the PPO baseline's [choice]."""
+"""Initial standard deviation if it does not depend on the state, as in the PPO baseline [choice]."""
 
 
 def symlog(values: Tensor) -> Tensor:
@@ -67,10 +67,10 @@ class MLP(nn.Module):
 
 
 class TwoHot(nn.Module):
-    """Categorical distribution over exponentially spaced values, for rewards and returns of any scale.
+    """Categorical distribution over exponentially spaced bins, for rewards and returns of any scale.
 
-    The bins are symexp of an even grid on [−20, 20]. A number is encoded as weights on its two neighbouring bins whose
-    mean is the number; logits are decoded to the mean of the bins.
+    The bins are symexp of an even grid on [−20, 20]. A number is encoded as weights on its two neighbouring bins, whose
+    weighted mean is the number; logits are decoded to the mean of the bins.
 
     Args:
         bins: K, odd, so that the middle bin is 0.
@@ -96,7 +96,7 @@ class TwoHot(nn.Module):
         self.register_buffer("values", torch.cat((-positive[1:].flip(0), positive)), persistent=False)
 
     def encode(self, target: Tensor) -> tuple[Tensor, Tensor]:
-        """Find the two bins around each number and their weights.
+        """Return the two bins around each number and their weights.
 
         Args:
             target: Numbers, ``(..., 1)``; those beyond the outermost bins are clamped to them.
@@ -115,9 +115,9 @@ class TwoHot(nn.Module):
         """Return the distribution's mean ``(..., 1)`` from logits ``(..., K)``."""
         probabilities = logits.softmax(-1)
         half = self.values.shape[0] // 2
-        # Mirrored bins are subtracted first: the bins reach 5e8, and uniform logits must still give exactly zero.
+        # Subtract mirrored bins first: the bins reach 5e8, and uniform logits must still give exactly zero.
         difference = probabilities[..., half + 1 :] - probabilities[..., :half].flip(-1)
-        # Not a matrix product, which autocast would round to bfloat16, and with it every return.
+        # Not a matrix product: autocast would compute it in bfloat16, and so round every return.
         return (difference * self.values[half + 1 :]).sum(-1, keepdim=True)
 
     def cross_entropy(self, log_probabilities: Tensor, target: Tensor) -> Tensor:
@@ -135,7 +135,7 @@ class TwoHot(nn.Module):
 
 
 class TwoHotHead(nn.Module):
-    """MLP whose output is a two-hot distribution; its first prediction is zero.
+    """MLP whose output is a two-hot distribution; its initial prediction is zero.
 
     Args:
         in_features: F.
@@ -160,7 +160,7 @@ class TwoHotHead(nn.Module):
 
 
 class ContinueHead(nn.Module):
-    """MLP whose output is the logit of "the episode goes on after this record"."""
+    """MLP that predicts the logit of the probability that the episode continues after a record."""
 
     def __init__(self, in_features: int, layers: int, units: int, norm: str = "rms") -> None:
         super().__init__()
@@ -176,7 +176,7 @@ class ContinueHead(nn.Module):
 
 
 class Critic(nn.Module):
-    """Distribution of the return from belief and state, with an exponential moving average of its own weights.
+    """Critic: predicts the distribution of the return, and has a slow copy, an exponential average of its weights.
 
     Args:
         in_features: F.
@@ -185,7 +185,7 @@ class Critic(nn.Module):
         norm: ``"rms"`` or ``"layer"``.
         bins: K.
 
-    Reference: DreamerV3, "Critic learning"; the slow copy regularises the critic, it is not the target.
+    Reference: DreamerV3, "Critic learning"; the slow copy regularises the critic and does not compute its targets.
     """
 
     def __init__(self, in_features: int, layers: int, units: int, norm: str = "rms", bins: int = 255) -> None:
@@ -195,7 +195,7 @@ class Critic(nn.Module):
 
     @property
     def two_hot(self) -> TwoHot:
-        """The distribution that the logits describe."""
+        """Distribution that the logits parametrise."""
         return self.head.two_hot
 
     def forward(self, features: Tensor) -> Tensor:
@@ -224,7 +224,7 @@ class Critic(nn.Module):
 class ActionDistribution(NamedTuple):
     """Independent normal distributions over the action's dimensions.
 
-    Samples may leave [−1, 1]: the environment and the RSSM clip them, and the log-probability is that of the normal.
+    Samples may leave [−1, 1]; the environment and the RSSM clip them. `log_prob` is that of the unclipped normal.
 
     Attributes:
         mean: ``(..., A)``, in [−1, 1].
@@ -235,15 +235,15 @@ class ActionDistribution(NamedTuple):
     std: Tensor
 
     def sample(self, noise: Tensor | None = None) -> Tensor:
-        """Draw an action ``(..., A)``, differentiable in mean and std; by normal noise ``(..., A)`` if it is given."""
+        """Sample an action ``(..., A)``, differentiable in mean and std, from normal noise ``(..., A)`` if given."""
         return torch.addcmul(self.mean, self.std, torch.randn_like(self.mean) if noise is None else noise)
 
     def clipped_mean(self) -> Tensor:
-        """Return the mean ``(..., A)`` of the actions that an environment gets: of the samples, clipped to [−1, 1].
+        """Return the mean ``(..., A)`` of the samples clipped to [−1, 1], which is the deterministic policy's action.
 
-        It is what the deterministic policy flies. Near a bound, noise keeps what is practised below ``mean``, by 0.06
-        at 1 with a deviation of 0.15, and an agent that has learned to fly a gate's width from its frame knows no
-        other flight (docs/what_we_know.md).
+        Near a bound, the average action in training is smaller than ``mean``, by 0.06 at a mean of 1 and a standard
+        deviation of 0.15; an agent that has learned to fly close to a gate's frame depends on that difference
+        (docs/what_we_know.md).
         """
         return clipped_mean(self.mean, self.std)
 
@@ -253,9 +253,9 @@ class ActionDistribution(NamedTuple):
         return -(0.5 * deviation.square() + self.std.log() + _LOG_SQRT_2PI).sum(-1, keepdim=True)
 
     def log_prob_clipped(self, action: Tensor) -> Tensor:
-        """Return the log-probability of what is left of an action ``(..., A)`` clipped to [−1, 1], nats, ``(..., 1)``.
+        """Return the log-probability of an action ``(..., A)`` after clipping to [−1, 1], nats, ``(..., 1)``.
 
-        Between the bounds it is the density of the normal, at a bound the probability of all that lies beyond it.
+        Between the bounds it is the normal's log-density, at a bound the log-probability of the tail beyond it.
 
         Reference: Fujita & Maeda 2018, "Clipped action policy gradient", Eq. 5.
         """
@@ -276,7 +276,7 @@ class ActionDistribution(NamedTuple):
 
 
 class Actor(nn.Module):
-    """Policy π(a | h, z): a normal of mean tanh(·) and of a standard deviation between two bounds.
+    """Policy π(a | h, z): a normal distribution with mean tanh(·) and a bounded standard deviation.
 
     Args:
         in_features: F.
@@ -284,10 +284,10 @@ class Actor(nn.Module):
         layers: Number of hidden layers.
         units: Width of the hidden layers.
         norm: ``"rms"`` or ``"layer"``.
-        min_std: Smallest standard deviation; a scalar that may change while the actor is trained.
+        min_std: Smallest standard deviation; a buffer that may change during training.
         max_std: Largest standard deviation; likewise.
-        state_std: Whether the deviation depends on the state; if not, it is a learned number for each dimension of the
-            action, ``FIRST_STD`` to begin with.
+        state_std: Whether the standard deviation depends on the state; if not, it is one learned number for each
+            dimension of the action, initially ``FIRST_STD``.
 
     Reference: danijar/dreamerv3, ``heads.bounded_normal``: std = lo + (hi − lo)·sigmoid(raw + 2).
     """
@@ -310,7 +310,7 @@ class Actor(nn.Module):
         self.few_kernels = False
         self.action_dim = action_dim
         shift = torch.tensor([0.0, STD_SHIFT] if state_std else [0.0]).repeat_interleave(action_dim)
-        self.shift = nn.Buffer(shift, persistent=False)  # of the network's output
+        self.shift = nn.Buffer(shift, persistent=False)  # added to the network's output
         self.min_std = nn.Buffer(torch.tensor(float(min_std)))
         self.max_std = nn.Buffer(torch.tensor(float(max_std)))
 
@@ -324,7 +324,7 @@ class Actor(nn.Module):
         return ActionDistribution(torch.tanh(mean), std)
 
     def _with_few_kernels(self, output: Tensor) -> ActionDistribution:
-        """Do what ``forward`` does behind the network, whose output ``(..., 2·A)`` or ``(..., A)`` is in any type."""
+        """Map the MLP's output ``(..., 2·A)`` or ``(..., A)`` of any type to the distribution, as ``forward`` does."""
         output = output + self.shift  # in float32
         mean, shifted = output.chunk(2, -1) if self.raw_std is None else (output, self._shifted_std(output))
         return ActionDistribution(torch.tanh(mean), torch.lerp(self.min_std, self.max_std, torch.sigmoid(shifted)))

@@ -1,4 +1,4 @@
-"""What an agent sees and does: the widths that an environment fixes."""
+"""Interface between agent and environment: keys and widths of observations and actions."""
 
 from __future__ import annotations
 
@@ -13,11 +13,11 @@ if TYPE_CHECKING:
 PIXELS = "pixels"
 """Key of the images that the agent sees, uint8 ``(..., height, width, 3)``."""
 VECTOR = "vector"
-"""Key of the numbers that the agent sees, float32 ``(..., V)``."""
+"""Key of the vector that the agent sees, float32 ``(..., V)``."""
 IMU = "imu"
-"""Key of the IMU's numbers, which it may see beside images instead: float32 ``(..., 6)``, rad/s and m/s²."""
+"""Key of the IMU readings that the agent may see besides images: float32 ``(..., 6)``, rad/s and m/s²."""
 PRIVILEGED = ("privileged", "vector")
-"""Key of the numbers that only a loss sees, float32 ``(..., P)``."""
+"""Key of the simulator's state, which only losses see, float32 ``(..., P)``."""
 
 
 @dataclass(frozen=True)
@@ -28,9 +28,9 @@ class Interface:
         action_dim: A.
         pixels: Whether the agent sees images under ``"pixels"``.
         image_size: Height and width of those images, pixels.
-        vector_dim: V, size of what it sees under ``vector_key``; 0 if nothing.
-        privileged_dim: P, size of what losses may use of ``("privileged", "vector")``; 0 if nothing.
-        vector_key: ``"vector"``, or ``"imu"``: whose numbers the agent sees.
+        vector_dim: V, width of the vector that the agent sees under ``vector_key``; 0 if none.
+        privileged_dim: P, width of ``("privileged", "vector")``, which losses may use; 0 if none.
+        vector_key: Key of the vector that the agent sees, ``"vector"`` or ``"imu"``.
 
     Raises:
         ValueError: If the agent would see nothing.
@@ -49,7 +49,7 @@ class Interface:
 
     @classmethod
     def of(cls, env: EnvBase) -> Interface:
-        """Read the interface off an environment's specs.
+        """Make the interface from an environment's specs.
 
         Raises:
             ValueError: If the environment has neither ``"pixels"`` nor ``"vector"``, or images that are not square.
@@ -65,7 +65,7 @@ class Interface:
 
     @property
     def image_shape(self) -> tuple[int, int, int]:
-        """Height, width and colours of an image."""
+        """Height, width and channels of an image."""
         return (self.image_size, self.image_size, 3)
 
     @property
@@ -75,5 +75,5 @@ class Interface:
 
     @property
     def replay_keys(self) -> list[NestedKey]:
-        """Keys of an observation that a replay must keep."""
+        """Keys of an observation that a replay buffer must store."""
         return [*self.observation_keys, *([PRIVILEGED] if self.privileged_dim else [])]

@@ -1,10 +1,10 @@
-"""Building blocks that every network shares: initialisation, normalisation, linear layers, and gradients of time loops.
+"""Building blocks of all networks: initialisation, normalisation, linear layers, and weight gradients of time loops.
 
-Weight gradients of layers inside a time loop are one matrix product after the loop, not one product and sum a step.
-Backpropagation through T steps adds T products of thin matrices to a gradient as large as the weight, so that memory
-traffic, not arithmetic, takes the time. Here each step only keeps its input and the gradient of its output.
+Ordinary backpropagation through T steps adds T products of thin matrices to a gradient as large as the weight, so
+memory traffic takes more time than arithmetic. Here each step of a time loop only stores its input and the gradient of
+its output, and one matrix product after the loop computes the weight's gradient.
 
-Shape legend: N any batch, of a loop that of a step; I input features, O output features, G blocks.
+Shape legend: N any batch (in a loop, that of one step), I input features, O output features, G blocks.
 """
 
 from __future__ import annotations
@@ -24,25 +24,25 @@ NORM_EPS = 1e-4
 """Epsilon of every normalisation layer. Reference: danijar/dreamerv3, ``nets.Norm``."""
 
 _TRUNCATED_NORMAL_STD = 0.87962566103423978
-"""Standard deviation of a unit normal truncated at ±2, by which the initial weights are corrected."""
+"""Standard deviation of a unit normal truncated at ±2; initial weights are divided by it."""
 
 
 def autocast(device: torch.device, enabled: bool) -> torch.autocast:
-    """Return the context in which a device computes in bfloat16, or float32 if not ``enabled``.
+    """Return the autocast context in which a device computes in bfloat16, or in float32 if not ``enabled``.
 
-    A device that knows no mixed precision (``meta``, on which FLOPs are counted) gets the context of the CPU.
+    A device type without autocast (``meta``, on which FLOPs are counted) gets the context of the CPU.
     """
     kind = device.type if torch.amp.is_autocast_available(device.type) else "cpu"
     return torch.autocast(kind, torch.bfloat16, enabled=enabled, cache_enabled=False)
 
 
 def initialize(weight: Tensor, fan_in: int, scale: float = 1.0) -> None:
-    """Fill a weight in place from a normal truncated at two deviations, of variance ``scale² / fan_in``.
+    """Fill a weight in place from a normal truncated at two standard deviations, with variance ``scale² / fan_in``.
 
     Args:
         weight: Parameter to fill, any shape.
         fan_in: Inputs that each output sums over.
-        scale: Multiplier of the deviation; 0 makes the layer output its bias.
+        scale: Multiplier of the standard deviation; 0 makes the layer output its bias.
 
     Reference: danijar/dreamerv3, initialiser ``trunc_normal_in``.
     """
@@ -54,7 +54,7 @@ def initialize(weight: Tensor, fan_in: int, scale: float = 1.0) -> None:
 
 
 class OfSteps:
-    """A parameter for the steps of one loop: their gradients are summed once after it, not one by one on the way.
+    """Parameter for the steps of one loop, whose gradients are summed once after the loop instead of step by step.
 
     Args:
         parameter: Any shape.
@@ -70,12 +70,12 @@ class OfSteps:
 
 
 class Linear(nn.Linear):
-    """Linear layer that a time loop may use; see ``unrolled``."""
+    """Linear layer whose weight gradient can be deferred until after a time loop; see ``unrolled``."""
 
     deferred: DeferredWeight | None = None
 
     def defer(self, with_bias: bool = True) -> DeferredWeight:
-        """Return weight and bias for the steps of one loop; the bias, which costs no kernel, goes along in any case."""
+        """Return weight and bias for the steps of one loop; the bias costs no kernel, so it is always included."""
         return DeferredWeight(self.weight.mT, self.bias)
 
     def forward(self, inputs: Tensor) -> Tensor:
@@ -83,7 +83,7 @@ class Linear(nn.Linear):
         return super().forward(inputs) if self.deferred is None else self.deferred.product(inputs)
 
     def plus(self, base: Tensor, inputs: Tensor) -> Tensor:
-        """Map ``(N, I)`` to ``(N, O)`` and add a base ``(N, O)``, in one kernel; without the layer's bias."""
+        """Map ``(N, I)`` to ``(N, O)`` without the layer's bias, and add a base ``(N, O)``, in one kernel."""
         if self.deferred is None:
             return torch.addmm(base, inputs, self.weight.mT)
         return self.deferred.product(inputs, base)
@@ -137,7 +137,7 @@ class RMSNorm(nn.Module):
     def forward(self, inputs: Tensor) -> Tensor:
         """Normalise ``(..., features)`` over its last dimension."""
         weight = self.weight if self.of_steps is None else self.of_steps["weight"].take()
-        # The cast does nothing but under autocast, where mixed types would leave the fused kernel.
+        # Under autocast, the cast avoids mixed types, which the fused kernel does not support.
         with in_own_type(inputs):
             return F.rms_norm(inputs, weight.shape, weight.to(inputs.dtype), NORM_EPS)
 
@@ -157,29 +157,29 @@ class LayerNorm(nn.LayerNorm):
         bias: Tensor = self.bias
         if self.of_steps is not None:
             weight, bias = (self.of_steps[name].take() for name in ("weight", "bias"))
-        if inputs.device.type != "cpu":  # where one kernel takes float32 beside bfloat16
+        if inputs.device.type != "cpu":  # the CPU's kernel accepts float32 with bfloat16
             weight, bias = weight.to(inputs.dtype), bias.to(inputs.dtype)
         with in_own_type(inputs):
             return F.layer_norm(inputs, self.normalized_shape, weight, bias, self.eps)
 
 
 def in_own_type(inputs: Tensor) -> Any:
-    """Return the context for what autocast of CUDA, but not of a CPU, would compute in float32: norms, upsampling.
+    """Return the context in which norms and upsampling keep the type of their inputs.
 
-    They gain nothing by it, for they compute their statistics in float32 anyway, and everything after them would have
-    to be cast back.
+    CUDA's autocast, unlike the CPU's, would compute them in float32. They gain nothing by it, because they compute
+    their statistics in float32 anyway, and their outputs would have to be cast back.
     """
     return nullcontext() if inputs.device.type == "cpu" else autocast(inputs.device, enabled=False)
 
 
 NORMS: dict[str, type[RMSNorm] | type[LayerNorm]] = {"rms": RMSNorm, "layer": LayerNorm}
-"""Normalisation classes by the name that a ``ModelSize`` gives."""
+"""Normalisation classes by ``ModelSize.norm``."""
 
 
 class NormedLinear(nn.Module):
     """Linear layer, normalisation, SiLU.
 
-    The linear layer has a bias only where the normalisation has no shift of its own.
+    The linear layer has a bias only if the normalisation has no shift.
 
     Args:
         in_features: I.
@@ -198,9 +198,9 @@ class NormedLinear(nn.Module):
 
 
 class SplitNormedLinear(nn.Module):
-    """``NormedLinear`` of two inputs side by side, whose second product can be computed ahead of a time loop.
+    """``NormedLinear`` of two concatenated inputs, whose second product can be computed before a time loop.
 
-    W·[a, b] = W_a·a + W_b·b: ``project`` gives W_b·b (plus bias) for a whole sequence at once.
+    W·[a, b] = W_a·a + W_b·b: ``project`` returns W_b·b (plus bias) for a whole sequence at once.
 
     Args:
         first_features: Size of a.
@@ -229,13 +229,13 @@ class SplitNormedLinear(nn.Module):
 
 
 class BlockLinear(nn.Module):
-    """Linear layer whose weight is block-diagonal: output block g sees input block g only.
+    """Linear layer with a block-diagonal weight: output block g depends on input block g only.
 
     Args:
         in_features: I, divisible by ``blocks``.
         out_features: O, divisible by ``blocks``.
         blocks: G.
-        fan_in: Inputs that each output sums over, where other layers add to this one's output; default I / G.
+        fan_in: Inputs that each output sums over, if other layers add to this layer's output; default I / G.
         bias: Whether the layer has a bias.
 
     Raises:
@@ -256,7 +256,7 @@ class BlockLinear(nn.Module):
         initialize(self.weight, fan_in or in_features // blocks)
 
     def defer(self, with_bias: bool = False) -> DeferredWeight:
-        """Return the weight for the steps of one loop, and the bias if it is to go with it."""
+        """Return the weight for the steps of one loop, and the bias if ``with_bias``."""
         bias = self.bias.view(self.blocks, 1, -1) if with_bias and self.bias is not None else None
         return DeferredWeight(self.weight, bias)
 
@@ -272,13 +272,13 @@ class BlockLinear(nn.Module):
 
 @contextmanager
 def unrolled(*modules: nn.Module, steps: int | None = None) -> Iterator[None]:
-    """Let the linear layers of modules that a time loop calls at every step compute their weight gradients after it.
+    """Defer the weight gradients of linear layers that a time loop calls until after the loop.
 
-    Gradients are the same but for rounding. Does nothing without gradients.
+    Gradients differ only by rounding. Does nothing if gradients are disabled.
 
     Args:
-        modules: That the loop calls, each layer of them once a step.
-        steps: Length of the loop, to do so for gains and biases, too: fewer kernels; None: no.
+        modules: Modules that the loop calls, with each layer once per step.
+        steps: Length of the loop, to defer the gradients of gains and biases, too (fewer kernels); None does not.
     """
     inside = [layer for module in modules for layer in module.modules()]
     if not torch.is_grad_enabled():
@@ -299,14 +299,14 @@ def unrolled(*modules: nn.Module, steps: int | None = None) -> Iterator[None]:
 
 
 class Tape:
-    """Input ``(..., N, I)`` and gradient of the output ``(..., N, O)`` of every step that a backward pass reaches."""
+    """Stores input ``(..., N, I)`` and output gradient ``(..., N, O)`` of every step in a backward pass."""
 
     def __init__(self) -> None:
         self._steps: list[tuple[Tensor, Tensor]] = []
         self._backward_pass = -1
 
     def add(self, inputs: Tensor, gradient: Tensor) -> None:
-        """Keep one step; forget those of a backward pass that did not ask for the weight's gradient."""
+        """Store one step; drop those of an earlier backward pass that did not need the weight's gradient."""
         backward_pass = torch._C._current_graph_task_id()
         if backward_pass != self._backward_pass:
             self._steps.clear()
@@ -314,7 +314,7 @@ class Tape:
         self._steps.append((inputs, gradient))
 
     def take(self) -> tuple[Tensor, Tensor] | None:
-        """Return all inputs and all gradients, ``(..., T·N, I)`` and ``(..., T·N, O)``, and forget them."""
+        """Return all inputs ``(..., T·N, I)`` and all gradients ``(..., T·N, O)``, and clear the tape."""
         if not self._steps:
             return None
         inputs, gradients = (torch.cat(tensors, -2) for tensors in zip(*self._steps, strict=True))
@@ -323,7 +323,7 @@ class Tape:
 
 
 class DeferredWeight:
-    """A weight for the steps of one loop; its gradient comes when all of them have passed theirs back.
+    """Weight for the steps of one loop, whose gradient is computed after the backward pass of all steps.
 
     Under autocast the weight is cast once, not at every step.
 
@@ -340,21 +340,21 @@ class DeferredWeight:
         self._weight, self._bias = _Collect.apply(weight.to(self._dtype), cast, self._tape)
 
     def product(self, inputs: Tensor, base: Tensor | None = None) -> Tensor:
-        """Map ``(..., N, I)`` to ``(..., N, O)``; where there is no bias, a base ``(N, O)`` may be added."""
+        """Map ``(..., N, I)`` to ``(..., N, O)``, plus the bias or a given base ``(N, O)``."""
         if base is not None:
             return _Sum.apply(base.to(self._dtype), inputs.to(self._dtype), self._weight, self._tape)
         return _Product.apply(inputs.to(self._dtype), self._weight, self._bias, self._tape)
 
 
 def autocast_type(device_type: str) -> torch.dtype | None:
-    """Return the type that autocast computes in on a kind of device; None where it is off."""
+    """Return autocast's type on a device type; None if autocast is off."""
     if not torch.amp.is_autocast_available(device_type) or not torch.is_autocast_enabled(device_type):
         return None
     return torch.get_autocast_dtype(device_type)
 
 
 class _Collect(Function):
-    """Hands out the weight; at the end of the backward pass, multiplies what the steps have kept."""
+    """Passes the weight to the steps; its backward multiplies the inputs and gradients on the tape."""
 
     @staticmethod
     def forward(ctx: FunctionCtx, weight: Tensor, bias: Tensor | None, tape: Tape) -> tuple[Tensor, Tensor | None]:
@@ -364,7 +364,7 @@ class _Collect(Function):
 
     @staticmethod
     def backward(ctx: Any, *gradients: Tensor | None) -> tuple[Tensor | None, ...]:
-        # The steps pass nothing back to the weight itself, but autograd calls this after the last of them.
+        # The steps return no gradient for the weight, but autograd calls this after the last of them.
         taken = ctx.tape.take()
         if taken is None:
             return None, None, None
@@ -374,7 +374,7 @@ class _Collect(Function):
 
 
 class _Product(Function):
-    """One step."""
+    """Product of one step."""
 
     @staticmethod
     def forward(ctx: FunctionCtx, inputs: Tensor, weight: Tensor, bias: Tensor | None, tape: Tape) -> Tensor:
@@ -392,7 +392,7 @@ class _Product(Function):
 
 
 class _Sum(Function):
-    """One step, added to something."""
+    """Product of one step, added to a base."""
 
     @staticmethod
     def forward(ctx: FunctionCtx, base: Tensor, inputs: Tensor, weight: Tensor, tape: Tape) -> Tensor:

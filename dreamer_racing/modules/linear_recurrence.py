@@ -14,13 +14,13 @@ from torch.autograd.function import FunctionCtx
 
 
 def linear_recurrence(decay: Tensor, drive: Tensor) -> Tensor:
-    """Compute ``h_t = decay_t · h_{t−1} + drive_t`` with h before the first step zero.
+    """Compute ``h_t = decay_t · h_{t−1} + drive_t``, with h = 0 before the first step.
 
-    Gradients are those of the loop over T, by the same scan in reverse: only decays and results are kept for them.
+    Gradients equal those of the loop over T, and are computed by the same scan in reverse from decays and results only.
 
     Args:
-        decay: In [0, 1], so that products of decays cannot overflow; 0 forgets all that was before. Float32
-            ``(B, T, D)``; that of the first step is of no effect.
+        decay: In [0, 1], so that products of decays cannot overflow; 0 forgets the past. Float32 ``(B, T, D)``; the
+            first step's decay has no effect.
         drive: Float32 ``(B, T, D)``.
 
     Returns:
@@ -38,7 +38,7 @@ def linear_recurrence(decay: Tensor, drive: Tensor) -> Tensor:
 
 
 def _scan(decay: Tensor, drive: Tensor) -> Tensor:
-    """Return h of every step; after each round, drive and decay of a step span twice as many steps."""
+    """Return h of every step; each round doubles the number of steps that a drive and a decay cover."""
     decay, drive = decay.clone(), drive.clone()
     time, span = decay.shape[1], 1
     while span < time:
@@ -58,7 +58,7 @@ class _LinearRecurrence(Function):
     @staticmethod
     def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor, Tensor]:
         decay, result = ctx.saved_tensors
-        # Of drive: g_t = gradient_t + decay_{t+1} · g_{t+1}, the same recurrence from the last step to the first.
+        # Gradient of drive: g_t = gradient_t + decay_{t+1} · g_{t+1}, the same recurrence from the last step backwards.
         later = torch.cat((decay[:, 1:], torch.zeros_like(decay[:, :1])), 1)
         of_drive = _scan(later.flip(1), gradient.flip(1)).flip(1)
         before = torch.cat((torch.zeros_like(result[:, :1]), result[:, :-1]), 1)

@@ -1,4 +1,4 @@
-"""RSSM without a loop over time: a diagonal state-space model, which a window runs through as a parallel scan.
+"""RSSM without a loop over time: a diagonal state-space model, computed over a window by a parallel scan.
 
 Shape legend: B batch, T time, N any one-dimensional batch, A action, E embedding, D belief, S state, U hidden,
 W = D / LAYERS channels of a layer.
@@ -18,19 +18,19 @@ from dreamer_racing.modules.recurrent_cells import SplitInputCell
 from dreamer_racing.modules.rssm import RSSM, Posterior
 
 LAYERS = 2
-"""Layers of the recurrence: channels of one do not see each other's past, those of the next one read all of it."""
+"""Layers of the recurrence; channels of one layer do not see each other's past, those of the next layer see all."""
 TIME_CONSTANTS = (2.0, 64.0)
-"""Shortest and longest memory of a fresh layer's channels, control steps; the others are spaced in between them,
-evenly in the logarithm. The project's own choice."""
+"""Shortest and longest initial time constant of a layer's channels, control steps; the others are spaced evenly in
+the logarithm. The project's own choice."""
 
 
 class DiagonalSSM(SplitInputCell):
-    """Layers of a selective diagonal state-space model, of which the belief is the states side by side.
+    """Layers of a selective diagonal state-space model; the belief is their states side by side.
 
-    ``ḣ = −h + x`` in each channel, discretised by zero-order hold over a step whose length the inputs choose:
+    ``ḣ = −h + x`` in each channel, discretised by zero-order hold over a step whose length depends on the inputs:
     ``h_t = α_t · h_{t−1} + (1 − α_t) · tanh(x_t)``. α and x depend on the previous state and action and on the layers
-    below, never on the layer's own past, so that h is linear in what it was: a scan computes a whole window. As a mean
-    of numbers in [−1, 1] the belief stays there, like that of a GRU.
+    below, never on the layer's own past, so h_t is linear in h_{t−1}, and a scan computes a whole window. As a weighted
+    mean of numbers in [−1, 1], the belief stays in that range, as in a GRU.
 
     Args:
         belief: D, divisible by ``LAYERS``.
@@ -38,7 +38,7 @@ class DiagonalSSM(SplitInputCell):
         action: A.
         hidden: U.
         norm: ``"rms"`` or ``"layer"``.
-        blocks: Ignored; here so that all cells are made alike.
+        blocks: Ignored; exists so that all cells have the same arguments.
 
     Raises:
         ValueError: If the belief cannot be divided among the layers.
@@ -61,18 +61,18 @@ class DiagonalSSM(SplitInputCell):
         self.mixes = nn.ModuleList(NormedLinear(width, hidden, norm) for _ in range(LAYERS - 1))
 
     def forward(self, belief: Tensor, state: Tensor, projected_action: Tensor, low: Tensor | None = None) -> Tensor:
-        """Return the next belief; arguments as in ``DenseGRUCell.forward``, of which ``low`` is not needed."""
+        """Return the next belief; arguments as in ``DenseGRUCell.forward``, but ``low`` is ignored."""
         return self._run(belief, state, projected_action, None)
 
     def scan(self, belief: Tensor, state: Tensor, projected_action: Tensor, begins: Tensor) -> Tensor:
         """Return the next belief of every step of a window.
 
         Args:
-            belief: Where a step begins from a given belief, that one; zero elsewhere. ``(B, T, D)``.
-            state: Before each step, ``(B, T, S)``.
+            belief: Given previous belief at the steps that start from one, else zero, ``(B, T, D)``.
+            state: State before each step, ``(B, T, S)``.
             projected_action: ``(B, T, U)``.
-            begins: Whether a step goes on from ``belief`` instead of from the step before it, bool ``(B, T, 1)``; the
-                first one always does.
+            begins: Whether a step starts from ``belief`` instead of the step before it, bool ``(B, T, 1)``; the first
+                step always does.
 
         Returns:
             ``(B, T, D)``.
@@ -85,7 +85,7 @@ class DiagonalSSM(SplitInputCell):
         for index, (gates, before) in enumerate(zip(self.gates, belief.chunk(LAYERS, -1), strict=True)):
             if index:
                 hidden = hidden + self.mixes[index - 1](after[-1])
-            # In float32, also under autocast: just below 1 numbers of bfloat16 are 0.004 apart.
+            # In float32, also under autocast: just below 1, bfloat16 numbers are 0.004 apart.
             decay, candidate = gates(hidden).float().chunk(2, -1)
             decay = torch.sigmoid(decay)
             drive = torch.lerp(torch.tanh(candidate), before, decay)
@@ -94,10 +94,10 @@ class DiagonalSSM(SplitInputCell):
 
 
 class EmbeddingLayer(NormedLinear):
-    """Hidden layer of a posterior that sees the embedding alone; the arguments and methods of ``SplitNormedLinear``.
+    """Hidden layer of a posterior that depends on the embedding alone, with the interface of ``SplitNormedLinear``.
 
     Args:
-        first_features: Ignored, as the belief is.
+        first_features: Ignored, like the belief.
         second_features: E.
         out_features: U.
         norm: Key of ``NORMS``.
@@ -111,15 +111,15 @@ class EmbeddingLayer(NormedLinear):
         return super().forward(second)
 
     def forward(self, first: Tensor, projected: Tensor) -> Tensor:  # type: ignore[override]  # as SplitNormedLinear's
-        """Return what was projected, ``(..., U)``."""
+        """Return ``projected`` as it is, ``(..., U)``."""
         return projected
 
 
 class ParallelRSSM(RSSM):
-    """RSSM whose posterior sees the observation alone: ``z_t ~ q(z | o_t)``, ``h_t = f(h_{t−1}, z_{t−1}, a_{t−1})``.
+    """RSSM with a posterior of the observation alone: ``z_t ~ q(z | o_t)``, ``h_t = f(h_{t−1}, z_{t−1}, a_{t−1})``.
 
-    All z of a window are known before the first h, which is linear in the one before it: ``observe`` has no loop over
-    T. ``observe_step`` and ``imagine_step`` are those of ``RSSM``, and compute the same function step by step.
+    All z of a window are computed before the first h, and h_t is linear in h_{t−1}, so ``observe`` needs no loop over
+    T. ``observe_step`` and ``imagine_step`` are inherited, and compute the same function step by step.
 
     Arguments as for ``RSSM``; the recurrence is ``"ssm"``.
 
@@ -145,7 +145,7 @@ class ParallelRSSM(RSSM):
         initial: tuple[Tensor, Tensor] | None = None,
         deterministic: bool = False,
     ) -> Posterior:
-        """Observe a sequence, all records at once; arguments and result as of ``RSSM.observe``."""
+        """Infer the latents of a sequence, all records at once; arguments and result as in ``RSSM.observe``."""
         batch, time = is_init.shape
         start = self.initial()
         belief, state = initial or (value.expand(batch, -1) for value in start)
@@ -154,7 +154,7 @@ class ParallelRSSM(RSSM):
         logits = self._posterior_logits(belief, self.posterior_hidden.project(embedding))
         noise = None if deterministic else self.draw_noise(time, batch).transpose(0, 1).contiguous()
         states = self._sample(logits, noise)
-        # What each step begins from: what was before it, or an episode's start.
+        # State and belief before each step: those of the step before, or of an episode's start.
         before = torch.cat((state.unsqueeze(1), states[:, :-1]), 1)
         before = torch.where(resets, start[1], before)
         given = torch.cat((belief.unsqueeze(1), belief.new_zeros(batch, time - 1, belief.shape[-1])), 1)

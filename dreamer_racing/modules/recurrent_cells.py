@@ -1,4 +1,4 @@
-"""Recurrent cells of an RSSM: the next belief from the belief, state and action before it.
+"""Recurrent cells of an RSSM, which compute the next belief from belief, state and action.
 
 Shape legend: N any one-dimensional batch, A action, D belief, S state, U hidden, G blocks, W = D / G.
 """
@@ -16,22 +16,22 @@ from torch.autograd.function import FunctionCtx
 from dreamer_racing.modules.layers import NORMS, BlockLinear, NormedLinear, SplitNormedLinear, linear
 
 UPDATE_SHIFT = 1.0
-"""By which the update gate is lower, so that a fresh cell remembers rather than overwrites."""
+"""Subtracted from the update gate, so that an untrained cell remembers rather than overwrites."""
 
 
 def gated_update(reset: Tensor, candidate: Tensor, update: Tensor, belief: Tensor) -> Tensor:
-    """Return the next belief from the gates before activation and the belief, each float32 ``(N, D)``."""
+    """Return the next belief from the gates' pre-activations and the belief, each float32 ``(N, D)``."""
     candidate = torch.tanh(torch.sigmoid(reset) * candidate)
     return torch.lerp(belief, candidate, torch.sigmoid(update - UPDATE_SHIFT))
 
 
 def gate_shift() -> Tensor:
-    """Return what is subtracted from reset, candidate and update, ``(3, 1)``."""
+    """Return the shifts that are subtracted from reset, candidate and update, ``(3, 1)``."""
     return torch.tensor([[0.0], [0.0], [UPDATE_SHIFT]])
 
 
 class GatedUpdate(Function):
-    """The GRU's step from its gates on: 5 kernels and 9 on the way back, where autograd's own take 7 and 14.
+    """GRU update from its gates, with 5 forward and 9 backward kernels instead of autograd's 7 and 14.
 
     ``apply(gates, shift, belief)`` takes gates ``(N, G, 3, W)`` in any type, in each block reset, candidate and update;
     ``gate_shift()`` in float32; and the belief, float32 ``(N, D)``. It returns the next belief, float32 ``(N, D)``.
@@ -56,7 +56,7 @@ class GatedUpdate(Function):
         of_candidate = gradient * squashed[:, :, 2]
         of_belief = (gradient - of_candidate).flatten(1)
         of_product = torch.ops.aten.tanh_backward(of_candidate, candidate)
-        of_squashed = torch.empty_like(squashed)  # the candidate's place stays empty: it is not squashed
+        of_squashed = torch.empty_like(squashed)  # the candidate's entry stays unset
         torch.mul(of_product, shifted[:, :, 1], out=of_squashed[:, :, 0])
         torch.mul(gradient, candidate - before, out=of_squashed[:, :, 2])
         of_gates = torch.ops.aten.sigmoid_backward(of_squashed, squashed)
@@ -65,7 +65,7 @@ class GatedUpdate(Function):
 
 
 class SplitInputCell(nn.Module):
-    """Recurrent cell that reads the state and the action through one normalised layer, the action's part ahead of time.
+    """Recurrent cell with one normalised input layer for state and action; the action's part is computed beforehand.
 
     Args:
         state: S.
@@ -93,7 +93,7 @@ class DenseGRUCell(SplitInputCell):
         action: A.
         hidden: U.
         norm: ``"rms"`` or ``"layer"``.
-        blocks: Ignored; here so that both cells are made alike.
+        blocks: Ignored; exists so that all cells have the same arguments.
     """
 
     def __init__(self, belief: int, state: int, action: int, hidden: int, norm: str, blocks: int = 1) -> None:
@@ -110,7 +110,7 @@ class DenseGRUCell(SplitInputCell):
             belief: ``(N, D)``.
             state: ``(N, S)``.
             projected_action: From ``project_action``, ``(N, U)``.
-            low: The belief in the type that autocast computes in, where it is there already.
+            low: The belief in autocast's type, if it was cast already.
 
         Returns:
             ``(N, D)``.
@@ -125,10 +125,10 @@ class DenseGRUCell(SplitInputCell):
 
 
 class BlockGRUCell(nn.Module):
-    """GRU of the 2025 DreamerV3: block-diagonal in the belief, so that a wide belief costs few weights.
+    """GRU of the 2025 DreamerV3: block-diagonal in the belief, so that a wide belief needs few weights.
 
-    The reference feeds every block the same 3·U inputs beside its own part of the belief. The product is the sum of a
-    dense layer of those inputs and a block-diagonal layer of the belief, which is how it is computed here.
+    The reference feeds every block the same 3·U inputs together with its own part of the belief. This equals the sum of
+    a dense layer on those inputs and a block-diagonal layer on the belief, which is computed here.
 
     Args:
         belief: D, divisible by ``blocks``.

@@ -1,8 +1,8 @@
-"""Recurrent state-space model: belief h, categorical state z, their dynamics, and how a replay keeps them.
+"""Recurrent state-space model (RSSM): belief h, categorical state z, their dynamics, and their format in a replay.
 
 Shape legend: B batch, T time, N any one-dimensional batch, A action, E embedding, D belief, L latents, K classes,
-S state = L·K, U hidden. The networks take and give plain tensors, so that a time
-loop costs a few kernels a step; only `LatentFormat` packs a TensorDict.
+S state = L·K, F = D + S features, U hidden. The networks use plain tensors, so that a step of a time loop costs few
+kernels; only `LatentFormat` uses TensorDict.
 """
 
 from __future__ import annotations
@@ -22,13 +22,13 @@ from dreamer_racing.modules.layers import NormedLinear, SplitNormedLinear, autoc
 from dreamer_racing.modules.recurrent_cells import BlockGRUCell, DenseGRUCell
 
 Begin = Callable[[int, Tensor, Tensor], tuple[Tensor, ...]]
-"""Belief and state from which step t goes on, of t and those that the step before left."""
+"""Function of a step's index and the latents after the step before that returns the latents the step starts from."""
 CONTEXT = "context"
-"""Key of a record under which lie the latents *before* its observation: ``belief`` and ``state``, packed."""
+"""Key of a record's latents *before* its observation: ``belief`` and ``state``, packed."""
 
 
 class Posterior(NamedTuple):
-    """What observing a sequence gives.
+    """Latents inferred from a sequence of observations, and their distributions.
 
     Attributes:
         belief: h, ``(B, T, D)``.
@@ -44,18 +44,18 @@ class Posterior(NamedTuple):
 
 
 def join_features(belief: Tensor, state: Tensor) -> Tensor:
-    """Concatenate belief ``(..., D)`` and state ``(..., S)`` into what every head reads, ``(..., F)``."""
+    """Concatenate belief ``(..., D)`` and state ``(..., S)`` to features ``(..., F)``, the input of all heads."""
     return torch.cat((belief, state), -1)
 
 
 class LatentFormat(NamedTuple):
-    """How latents are packed: the belief as float16, the state as the class of each latent, or its probabilities.
+    """Packed format of latents: the belief as float16, the state as the class of each latent or as probabilities.
 
     Attributes:
         belief: D.
         latents: L.
         classes: K.
-        sampled: Whether states are one-hots, of which the class is kept (uint8), or probabilities (float16).
+        sampled: Whether states are one-hots, stored as classes (uint8), or probabilities, stored as float16.
 
     Example:
         >>> import torch
@@ -72,11 +72,11 @@ class LatentFormat(NamedTuple):
 
     @property
     def bytes(self) -> int:
-        """What the latents of one record take."""
+        """Size of the packed latents of one record."""
         return 2 * self.belief + self.latents * (1 if self.sampled else 2 * self.classes)
 
     def pack(self, belief: Tensor, state: Tensor) -> TensorDict:
-        """Pack belief ``(*N, D)``, in [−1, 1], and state ``(*N, S)``; batch ``[*N]``. Floats are within 5e-4 after."""
+        """Pack belief ``(*N, D)``, in [−1, 1], and state ``(*N, S)`` to a batch ``[*N]``; floats are off by ≤ 5e-4."""
         if self.sampled:
             state = state.unflatten(-1, (self.latents, self.classes)).argmax(-1).to(torch.uint8)
         else:
@@ -84,16 +84,16 @@ class LatentFormat(NamedTuple):
         return TensorDict({"belief": belief.half(), "state": state}, belief.shape[:-1], device=belief.device)
 
     def unpack(self, packed: TensorDictBase) -> tuple[Tensor, Tensor]:
-        """Return belief ``(*N, D)`` and state ``(*N, S)``, float32, of packed latents ``[*N]``."""
+        """Return belief ``(*N, D)`` and state ``(*N, S)``, float32, from packed latents ``[*N]``."""
         belief, state = packed.get("belief").float(), packed.get("state")
         if self.sampled:
-            # Not one_hot, which looks at the classes first.
+            # Not one_hot, which checks the classes first and so waits for the device.
             state = (state.unsqueeze(-1) == torch.arange(self.classes, device=state.device)).flatten(-2)
         return belief, state.float()
 
 
 def mix_uniform(logits: Tensor, unimix: float) -> Tensor:
-    """Return the probabilities ``(1 − unimix)·softmax(logits) + unimix / K``, shape as ``logits``."""
+    """Return the probabilities ``(1 − unimix)·softmax(logits) + unimix / K``, in the shape of ``logits``."""
     probabilities = torch.softmax(logits, -1)
     return torch.add(probabilities * (1.0 - unimix), unimix / logits.shape[-1])
 
@@ -101,14 +101,14 @@ def mix_uniform(logits: Tensor, unimix: float) -> Tensor:
 def sample_one_hot(
     probabilities: Tensor, noise: Tensor | None, blank: Tensor | None = None, dtype: torch.dtype | None = None
 ) -> Tensor:
-    """Choose one class of each latent.
+    """Choose one class for each latent.
 
     Args:
         probabilities: ``(..., L, K)``.
-        noise: Uniform numbers in [0, 1), ``(..., L, 1)``, at which the distribution function is inverted (one number a
-            latent, where Gumbel noise needs one a class); None takes the mode.
-        blank: Zeros ``(..., L, K)`` that are written on; None makes some.
-        dtype: Of these; None: that of the probabilities. It holds 0 and 1.
+        noise: Uniform numbers in [0, 1), ``(..., L, 1)``, at which the cumulative distribution is inverted (one number
+            per latent, while Gumbel noise needs one per class); None takes the mode.
+        blank: Zeros ``(..., L, K)`` to write the result to; None allocates them.
+        dtype: Type of allocated zeros; None for that of the probabilities.
 
     Returns:
         One-hots ``(..., L, K)`` whose gradient is that of ``probabilities`` (straight-through).
@@ -117,14 +117,14 @@ def sample_one_hot(
     if noise is None:
         index = fixed.argmax(-1, keepdim=True)
     else:
-        # Without the last sum, which rounding may leave just below 1, and below the number.
+        # Without the last sum, because rounding may leave it just below 1, and below the noise.
         index = torch.searchsorted(fixed[..., :-1].cumsum(-1), noise, right=True)
     one_hot = (torch.zeros_like(fixed, dtype=dtype) if blank is None else blank).scatter_(-1, index, 1.0)
     return _StraightThrough.apply(one_hot, probabilities) if probabilities.requires_grad else one_hot
 
 
 class _StraightThrough(Function):
-    """Passes a sample on, and its gradient to the probabilities that it was drawn by."""
+    """Returns a sample, and passes its gradient to the probabilities that it was drawn from."""
 
     @staticmethod
     def forward(ctx: FunctionCtx, sample: Tensor, probabilities: Tensor) -> Tensor:
@@ -138,8 +138,8 @@ class _StraightThrough(Function):
 class RSSM(nn.Module):
     """World model's dynamics: ``h_t = f(h_{t−1}, z_{t−1}, a_{t−1})``, ``z_t ~ q(z | h_t, o_t)`` or ``p(z | h_t)``.
 
-    Where ``is_init``, the previous belief and state are the initial ones and the previous action is zero. Actions are
-    clipped to [−1, 1], as the environment does.
+    If ``is_init`` is set, previous belief and state are the initial ones, and the previous action is zero. Actions are
+    clipped to [−1, 1], as in the environment.
 
     Args:
         embedding: E.
@@ -148,14 +148,14 @@ class RSSM(nn.Module):
         latents: L.
         classes: K.
         hidden: U.
-        recurrence: Key of ``cells``; default the first.
+        recurrence: Key of ``cells``; by default the first.
         blocks: Blocks of the block GRU.
         prior_layers: Hidden layers from h to the prior's logits.
         norm: ``"rms"`` or ``"layer"``.
         learned_initial: Whether the initial belief is learned (then the initial state is the prior's mode) or zero.
         unimix: Share of the uniform distribution in every categorical.
-        sampled: Whether a state is a sample of its categoricals, as in DreamerV3, or their probabilities themselves:
-            then nothing is drawn, in acting, training and imagination alike.
+        sampled: Whether a state is a sample of its categoricals, as in DreamerV3, or their probabilities themselves, so
+            that latents are deterministic in acting, training and imagination.
 
     Raises:
         ValueError: If there is no cell of that name.
@@ -171,9 +171,9 @@ class RSSM(nn.Module):
     """
 
     cells: ClassVar[dict[str, Any]] = {"block": BlockGRUCell, "dense": DenseGRUCell}
-    """Recurrent cells by the name that a ``ModelSize`` gives."""
+    """Recurrent cells by ``ModelSize.recurrence``."""
     posterior_layer: ClassVar[Any] = SplitNormedLinear
-    """Hidden layer of the posterior, of belief and embedding."""
+    """Class of the posterior's hidden layer, on belief and embedding."""
 
     def __init__(
         self,
@@ -219,7 +219,7 @@ class RSSM(nn.Module):
 
     @property
     def latent_format(self) -> LatentFormat:
-        """How a replay keeps its latents."""
+        """Format in which a replay buffer stores the latents."""
         return LatentFormat(self.initial_belief.shape[-1], self.latents, self.classes, self.sampled)
 
     def prior_logits(self, belief: Tensor) -> Tensor:
@@ -227,7 +227,7 @@ class RSSM(nn.Module):
         return self.prior(belief).float().unflatten(-1, (self.latents, self.classes))
 
     def draw_noise(self, *batch: int) -> Tensor:
-        """Draw the noise that samples states of a batch, ``(*batch, L, 1)``."""
+        """Draw the uniform noise for sampling states of a batch, ``(*batch, L, 1)``."""
         return torch.rand(*batch, self.latents, 1, device=self.initial_belief.device)
 
     def observe(
@@ -238,13 +238,13 @@ class RSSM(nn.Module):
         initial: tuple[Tensor, Tensor] | None = None,
         deterministic: bool = False,
     ) -> Posterior:
-        """Unroll over a sequence of observations.
+        """Infer the latents of a sequence of observations.
 
         Args:
             embedding: ``(B, T, E)``.
             previous_action: The action that led to each observation, ``(B, T, A)``.
             is_init: Whether each observation is its episode's first, bool ``(B, T)``.
-            initial: Belief ``(B, D)`` and state ``(B, S)`` before the sequence; default an episode's start.
+            initial: Belief ``(B, D)`` and state ``(B, S)`` before the sequence; by default those of an episode's start.
             deterministic: Take the posterior's mode instead of a sample.
 
         Returns:
@@ -281,7 +281,7 @@ class RSSM(nn.Module):
         state: Tensor,
         deterministic: bool = False,
     ) -> tuple[Tensor, Tensor]:
-        """Take in one observation, for acting; the same maths as one step of ``observe``.
+        """Update the latents by one observation, for acting; the same maths as one step of ``observe``.
 
         Args:
             embedding: ``(N, E)``.
@@ -298,13 +298,13 @@ class RSSM(nn.Module):
         return belief, self.take_in(belief, embedding, deterministic)
 
     def advance(self, previous_action: Tensor, is_init: Tensor, belief: Tensor, state: Tensor) -> Tensor:
-        """Return the next belief ``(N, D)``, which needs no observation yet; arguments as of ``observe_step``."""
+        """Return the next belief ``(N, D)``, which needs no observation; arguments as in ``observe_step``."""
         reset, start = is_init.unsqueeze(-1), self.initial()
         action = self._project_action(previous_action, reset)
         return self.cell(torch.where(reset, start[0], belief), torch.where(reset, start[1], state), action)
 
     def take_in(self, belief: Tensor, embedding: Tensor, deterministic: bool = False) -> Tensor:
-        """Return the state ``(N, S)`` by the next belief and what is seen; arguments as of ``observe_step``."""
+        """Return the posterior state ``(N, S)`` for the next belief and an embedding, as in ``observe_step``."""
         noise = None if deterministic else self.draw_noise(len(belief))
         return self._sample(self.posterior_logits(belief, embedding), noise)
 
@@ -320,7 +320,7 @@ class RSSM(nn.Module):
         Args:
             belief: ``(N, D)``.
             state: ``(N, S)``.
-            action: The action taken there, ``(N, A)``.
+            action: ``(N, A)``.
             deterministic: Take the prior's mode instead of a sample.
 
         Returns:
@@ -331,15 +331,15 @@ class RSSM(nn.Module):
         return belief, self._sample(self.prior_logits(belief), noise)
 
     def _state_type(self, belief: Tensor) -> torch.dtype:
-        """Return the type of states in a loop: where they are one-hots, that in which autocast computes will do."""
+        """Return the type of states in the time loop; autocast's type represents one-hots exactly."""
         low = autocast_type(belief.device.type) if self.few_kernels and self.sampled else None
         return low or belief.dtype
 
     def _begin_steps(self, resets: Tensor, start: tuple[Tensor, Tensor]) -> Begin:
-        """Return what lets the steps of a window ``(B, T, 1)`` begin from an episode's start where it is reset.
+        """Return the function that replaces the latents before a step by an episode's start where it is reset.
 
-        A choice takes one kernel, and four on the way back, to make the zeros of what was not chosen; with
-        ``few_kernels`` it is a multiplication, one and one.
+        ``torch.where`` takes one kernel forward and four backward, which make the zero gradients of the other choice;
+        ``few_kernels`` uses a multiplication, with one and one. ``resets`` is ``(B, T, 1)``.
         """
         if not self.few_kernels:
             choices = resets.unbind(1)
@@ -353,17 +353,17 @@ class RSSM(nn.Module):
         )
 
     def imagine_low(self, belief: Tensor, features: Tensor, action: Tensor, noise: Tensor, following: Tensor) -> Tensor:
-        """Do what ``imagine_step`` does, with every latent cast once, and where it is to be.
+        """Do the same as ``imagine_step``, but cast latents only once, and write them into a given tensor.
 
         Args:
             belief: ``(N, D)``.
-            features: Belief and state in the type that autocast computes in, ``(N, F)``.
+            features: Belief and state in autocast's type, ``(N, F)``.
             action: ``(N, A)``.
             noise: ``(N, L, 1)``.
-            following: Zeros of that type, ``(N, F)``, on which the next belief and state are written.
+            following: Zeros of that type, ``(N, F)``, to which the next belief and state are written.
 
         Returns:
-            The next belief, in its own type.
+            The next belief, in the type of ``belief``.
         """
         width = belief.shape[-1]
         action = self.cell.project_action(action.clamp(-1.0, 1.0))
@@ -376,7 +376,7 @@ class RSSM(nn.Module):
         return belief
 
     def _project_action(self, previous_action: Tensor, reset: Tensor) -> Tensor:
-        """Clip, zero where ``reset`` and project actions ``(..., A)``."""
+        """Clip actions ``(..., A)``, set them to zero where ``reset``, and project them."""
         return self.cell.project_action(previous_action.clamp(-1.0, 1.0).masked_fill(reset, 0.0))
 
     def _observe(
@@ -388,7 +388,7 @@ class RSSM(nn.Module):
         noise: Tensor | None,
         dtype: torch.dtype | None = None,
     ) -> tuple[Tensor, Tensor, Tensor]:
-        """Step belief ``(N, D)`` and state ``(N, S)``, and return them with the posterior's logits ``(N, L, K)``."""
+        """Return the next belief ``(N, D)`` and state ``(N, S)`` with the posterior's logits ``(N, L, K)``."""
         belief = self.cell(belief, state, projected_action)
         logits = self._posterior_logits(belief, embedded)
         return belief, self._sample(logits, noise, dtype=dtype), logits
@@ -401,7 +401,7 @@ class RSSM(nn.Module):
     def _sample(
         self, logits: Tensor, noise: Tensor | None, blank: Tensor | None = None, dtype: torch.dtype | None = None
     ) -> Tensor:
-        """Return states ``(..., S)`` by logits ``(..., L, K)``; the other arguments are those of ``sample_one_hot``."""
+        """Return states ``(..., S)`` for logits ``(..., L, K)``; other arguments as in ``sample_one_hot``."""
         if self.few_kernels:
             probabilities = torch.lerp(torch.softmax(logits, -1), self.uniform, self.unimix)
         else:

@@ -1,4 +1,4 @@
-"""Named model sizes: every number that fixes the shape of the agent's networks."""
+"""Model sizes by name: all numbers that determine the shapes of the agent's networks."""
 
 from __future__ import annotations
 
@@ -10,32 +10,32 @@ class ModelSize:
     """Widths and variants of all networks.
 
     Attributes:
-        name: Key in ``SIZES``, or any name for a size of your own.
+        name: Key in ``SIZES``, or any name for your own size.
         belief: Width of the recurrent state h.
         hidden: Width of the RSSM's inner layers.
         latents: Number of categorical latents in z.
         classes: Classes of each categorical latent.
         units: Width of the reward, continue, actor and critic layers.
         recurrence: ``"block"`` (2025 block GRU), ``"dense"`` (2023 GRU) or ``"ssm"`` (an extension: a diagonal
-            state-space model, which a training window runs through as a parallel scan; the posterior then sees the
+            state-space model, computed over a training window by a parallel scan; its posterior depends on the
             observation alone).
         blocks: Diagonal blocks of the block GRU and of the decoder's first layer (1: dense decoder input).
         prior_layers: Hidden layers from h to the prior's logits.
         head_layers: Hidden layers of the reward and continue heads.
         actor_critic_layers: Hidden layers of actor and critic.
-        vector_layers: Hidden layers, ``units`` wide, of the encoder and decoder of numbers.
-        norm: ``"rms"`` or ``"layer"``; layer norm is much the cheaper on CPU.
+        vector_layers: Hidden layers, ``units`` wide, of the encoder and decoder of vectors.
+        norm: ``"rms"`` or ``"layer"``; layer norm is much cheaper on a CPU.
         learned_initial: Whether an episode's first h is learned (2023) or zero (2025).
         cnn_depth: Channels of a convolution are ``cnn_depth * multiplier``.
-        cnn_multipliers: One per halving of the image.
+        cnn_multipliers: One multiplier for each halving of the image.
         cnn_kernel: Kernel size of every convolution, pixels.
-        strided: Halve by stride (a quarter of the FLOPs) rather than by 2×2 max-pool.
+        strided: Halve by stride 2 (a quarter of the FLOPs) rather than by 2×2 max-pool.
         cnn_patch: Side of the pixel blocks folded into channels before the first convolution (1: none). With 2, the
-            widest maps and their normalisation disappear, at nearly the same FLOPs.
+            largest maps and their normalisation disappear, at nearly the same FLOPs.
         bins: Bins of the two-hot reward and value distributions.
         sampled: Whether z is a sample of its categoricals, as in DreamerV3, or their probabilities (an extension: the
-            latents are then deterministic, and so is imagination but for the actor's noise).
-        state_std: Whether the standard deviation of actions depends on the state, as in DreamerV3, or is a learned
+            latents are then deterministic, and so is imagination except for the actor's noise).
+        state_std: Whether the standard deviation of actions depends on the state, as in DreamerV3, or is one learned
             number for each dimension of the action, as usual with PPO.
     """
 
@@ -69,12 +69,12 @@ class ModelSize:
 
     @property
     def features(self) -> int:
-        """Width of what the heads read: h and z."""
+        """Width of the heads' input, h and z side by side."""
         return self.belief + self.state
 
 
 def _reference(name: str, belief: int, hidden: int, classes: int) -> ModelSize:
-    """Size of the 2025 reference, where depth equals classes and units equal hidden."""
+    """Return a size of the 2025 reference, where ``cnn_depth`` equals ``classes``, and ``units`` equals ``hidden``."""
     return ModelSize(name, belief=belief, hidden=hidden, classes=classes, units=hidden, cnn_depth=classes)
 
 
@@ -97,13 +97,13 @@ _CPU = ModelSize(
     strided=True,
     cnn_patch=2,
 )
-"""What is cheap on CPU: fused layer norm, few calls a recurrent step, strided convolutions on folded pixels.
+"""Size that is cheap on a CPU: fused layer norm, few calls per recurrent step, strided convolutions on folded pixels.
 
 Channels in multiples of 16 fill the vector registers: 16-32-64 takes 60 % of the time of 24-36-48."""
 
 
 def _paper(name: str, belief: int, units: int, layers: int, cnn_depth: int) -> ModelSize:
-    """Size of the 2023 reference: the architecture of the paper, not the block GRU of the same widths."""
+    """Return a size of the 2023 reference, with the paper's architecture instead of the block GRU."""
     return ModelSize(
         name,
         belief=belief,
@@ -147,8 +147,8 @@ SIZES: dict[str, ModelSize] = {
 }  # fmt: skip
 """Sizes by name.
 
-Reference: ``size*`` danijar/dreamerv3 ``configs.yaml``; ``paper_*`` S, M and L of Hafner et al. 2023, Appendix B, of
-which the paper uses L; ``ssm_*`` are the same widths with a state-space model in place of the GRU."""
+Reference: ``size*`` are from danijar/dreamerv3 ``configs.yaml``; ``paper_*`` are S, M and L of Hafner et al. 2023,
+Appendix B, of which Dream to Fly uses L; ``ssm_*`` have a state-space model in place of the GRU."""
 
 SIZES |= {
     f"ssm_{name}": replace(SIZES[name], name=f"ssm_{name}", recurrence="ssm")
@@ -157,13 +157,13 @@ SIZES |= {
 
 
 def get_size(size: ModelSize | str) -> ModelSize:
-    """Return a size itself, or the one of that name.
+    """Return the size of a name, or a given ``ModelSize`` as it is.
 
     Args:
         size: A ``ModelSize`` or a key of ``SIZES``.
 
     Raises:
-        ValueError: If no size has that name; the message lists those that exist.
+        ValueError: If no size has that name; the message lists the known names.
 
     Example:
         >>> get_size("size12m").belief

@@ -1,6 +1,6 @@
 """World model: encoder, RSSM, decoders, reward and continue heads.
 
-Shape legend: B batch, T time, A action, V numbers seen, D belief, S state, F = D + S features.
+Shape legend: B batch, T time, A action, V width of the observed vector, D belief, S state, F = D + S features.
 """
 
 from __future__ import annotations
@@ -18,23 +18,23 @@ from dreamer_racing.modules.rssm import RSSM, Posterior
 from dreamer_racing.modules.sizes import ModelSize, get_size
 
 RSSMS: dict[str, type[RSSM]] = {recurrence: kind for kind in (RSSM, ParallelRSSM) for recurrence in kind.cells}
-"""Dynamics by the recurrence that a ``ModelSize`` gives."""
+"""RSSM classes by ``ModelSize.recurrence``."""
 
 
 class WorldModel(nn.Module):
-    """Everything that predicts: observations, rewards, ends of episodes and the next state.
+    """Networks that infer latents, and predict the next latents, observations, rewards and episode ends.
 
     Args:
         size: A ``ModelSize`` or its name.
-        interface: What the agent sees and does.
-        decode: Whether to have the decoders of what is seen; losses that decode nothing do without.
+        interface: Observations and actions of the agent.
+        decode: Whether to make the decoders of observations, which some losses do not need.
 
     Attributes:
         decoder: ``ImageDecoder``, or None.
-        vector_decoder: ``VectorDecoder`` of what is seen under ``"vector"``, or None.
+        vector_decoder: ``VectorDecoder`` of the observed vector, or None.
 
     Raises:
-        ValueError: If there is no recurrence of the name that the size gives.
+        ValueError: If the size has an unknown ``recurrence``.
 
     Example:
         >>> import torch
@@ -100,10 +100,10 @@ class WorldModel(nn.Module):
         is_init: Tensor,
         deterministic: bool = False,
     ) -> Posterior:
-        """Encode and unroll a sequence of records.
+        """Encode a sequence of records, and infer their latents.
 
         Args:
-            observation: What was seen, by key: ``pixels`` uint8 ``(B, T, height, width, 3)``, ``vector`` ``(B, T, V)``.
+            observation: Observations by key: ``pixels`` uint8 ``(B, T, height, width, 3)``, ``vector`` ``(B, T, V)``.
             previous_action: ``(B, T, A)``.
             is_init: bool ``(B, T)``.
             deterministic: Take the posterior's mode instead of a sample.
@@ -119,7 +119,7 @@ class WorldModel(nn.Module):
     ) -> tuple[Tensor, Tensor]:
         """Observe the first records, then predict the others from their actions alone.
 
-        Beyond the context nothing is observed: a reset there is not followed.
+        Resets beyond the observed records are ignored.
 
         Args:
             observation: As for ``observe``; only the first ``context`` records are read.
@@ -146,7 +146,7 @@ class WorldModel(nn.Module):
         return torch.cat((posterior.belief, predicted[0]), 1), torch.cat((posterior.state, predicted[1]), 1)
 
     def predict(self, belief: Tensor, state: Tensor, actions: Tensor) -> tuple[Tensor, Tensor]:
-        """Predict from actions alone.
+        """Predict latents from actions alone.
 
         Args:
             belief: ``(B, D)``, before the first action.

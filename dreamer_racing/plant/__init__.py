@@ -1,7 +1,7 @@
-"""The other end of a flight: a drone of this project's physics in a process of its own, where a real one would be.
+"""A simulated drone in a separate process, with this project's physics, in place of a real one.
 
-`vehicle` is the drone, with what sets it apart from the one that was trained on; `commands` or `betaflight_sitl` moves
-it; `delivery` sends its poses as a motion-capture system would; `process` keeps all of it in time.
+`vehicle` is the drone, with its differences from the training model; `commands` or `betaflight_sitl` controls it;
+`delivery` sends its poses as a motion-capture system would; `process` runs it by a clock, or in lock step.
 """
 
 import dreamer_racing.envs  # noqa: F401 - before MuJoCo, whose variables it heeds

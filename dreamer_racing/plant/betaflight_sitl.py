@@ -1,14 +1,14 @@
-"""A flight controller that is the real firmware: Betaflight, built for a computer (SITL), in a process of its own.
+"""The real Betaflight firmware as flight controller, built for a computer (SITL), in a separate process.
 
-It gets the state of the vehicle (UDP port 9003) and answers with motor commands (9002), both little endian:
+It receives the state of the vehicle (UDP port 9003) and answers with motor commands (9002), both little endian:
 
-| packet | bytes | what |
+| packet | bytes | content |
 |---|---|---|
 | state | 144 | 18 f64: time, body rates, acceleration, attitude wxyz, velocity, position, air pressure in Pa |
 | motors | 16 | 4 f32 in [0, 1]; idle is above 0, disarmed is 0 |
 
-The firmware turns these around: acceleration as a whole, body rates about y, about z also before 2026.6. Its channels
-(9004) come from `hil.links`. Everything is for one machine: nothing here is meant to leave it.
+The firmware inverts the signs of some: the whole acceleration, body rates about y, and about z before 2026.6. Its
+channels (9004) come from `hil.links`. All traffic is meant to stay on one machine.
 
 Reference: Betaflight, src/platform/SIMULATOR/sitl.c (updateState) and target/SITL/target.h (fdm_packet, servo_packet);
 measured answers of the firmware.
@@ -29,16 +29,16 @@ from dreamer_racing.plant.vehicle import PlantVehicle
 
 STATE_PORT, MOTOR_PORT = 9003, 9002
 _STATE, _MOTORS = struct.Struct("<18d"), struct.Struct("<4f")
-_STAMP = 1.0  # s, always: the firmware sets the pace of its clock by stamps, and loses the radio if they jitter
+_STAMP = 1.0  # s, constant: the firmware paces its clock by timestamps, and loses the radio if they jitter
 
 
 class Dialect(NamedTuple):
-    """How a firmware lays out its packets.
+    """Conventions of a firmware's packets.
 
     Args:
         rotors: (4,) index of the rotor of each motor command: M1 … M4 are rear right, front right, rear left, front
             left, indices 0 … 3.
-        yaw_rate_sign: Of the body rate about z that it is sent, against FLU.
+        yaw_rate_sign: Sign of the body rate about z in state packets, relative to FLU.
     """
 
     rotors: tuple[int, int, int, int]
@@ -50,13 +50,13 @@ DIALECTS = {"2026.6": Dialect((0, 1, 2, 3), 1.0), "before": Dialect((1, 2, 3, 0)
 
 
 def dialect_of(release: str) -> Dialect:
-    """Return how a release lays out its packets.
+    """Return the packet conventions of a release.
 
     Args:
         release: Its number, such as 4.6.0, 2025.12 or 2026.12.0-alpha, or ``before`` for any before 2026.6.
 
     Raises:
-        ValueError: It is no number of a release.
+        ValueError: It is not the number of a release.
     """
     if release in DIALECTS:
         return DIALECTS[release]
@@ -67,12 +67,12 @@ def dialect_of(release: str) -> Dialect:
 
 
 def encode_state(pose: Pose, specific_force: np.ndarray, dialect: Dialect) -> bytes:
-    """Return the packet that tells the firmware where the vehicle is.
+    """Return the state packet for the firmware.
 
     Args:
-        pose: Of the vehicle.
+        pose: Pose of the vehicle.
         specific_force: (3,) m/s², body frame: +9.81 upwards at rest.
-        dialect: Of the firmware.
+        dialect: The firmware's packet conventions.
     """
     x, y, z = pose.body_rates
     rates = (x, -y, dialect.yaw_rate_sign * z)
@@ -82,7 +82,7 @@ def encode_state(pose: Pose, specific_force: np.ndarray, dialect: Dialect) -> by
 
 
 def decode_motors(data: bytes, dialect: Dialect) -> np.ndarray | None:
-    """Return the motor commands (4,) in [0, 1] by rotor; None if the packet is none."""
+    """Return the motor commands (4,) in [0, 1] by rotor; None if the packet is invalid."""
     if len(data) != _MOTORS.size:
         return None
     motors = np.array(_MOTORS.unpack(data))
@@ -94,21 +94,21 @@ def decode_motors(data: bytes, dialect: Dialect) -> np.ndarray | None:
 
 
 class BetaflightSitl:
-    """Flies the vehicle by the firmware: `Controls`.
+    """`Controls` that fly the vehicle by the motor commands of the firmware.
 
     Args:
-        vehicle: Which; its delay and body-rate controller are out of play.
+        vehicle: The vehicle; its delay and body-rate controller are not used.
         send: Sends a state packet to the firmware.
         firmware: Its release, see `dialect_of`.
         timeout: s, of `Failsafe`.
 
     Attributes:
-        received: Motor packets.
-        malformed: Messages that were none.
+        received: Number of motor packets.
+        malformed: Number of messages that were not motor packets.
         failsafe: Decides whether motors may turn.
 
     Raises:
-        ValueError: It is no release.
+        ValueError: ``firmware`` is not a release.
     """
 
     def __init__(
@@ -132,7 +132,7 @@ class BetaflightSitl:
         self._send(encode_state(self._vehicle.pose(), self._vehicle.specific_force, self._dialect))
 
     def take(self, data: bytes, time: float) -> bool:
-        """Take a motor packet; return whether it was one."""
+        """Apply a motor packet; return whether it was valid."""
         motors = decode_motors(data, self._dialect)
         if motors is None:
             self.malformed += 1
@@ -143,5 +143,5 @@ class BetaflightSitl:
         return True
 
     def summary(self) -> str:
-        """Say what came in."""
+        """Return a phrase on what was received."""
         return f"{self.received} motor packets ({self.malformed} malformed), {self.failsafe.events} failsafe(s)"

@@ -1,4 +1,4 @@
-"""What moves the drone: command packets, and what is done when they stop."""
+"""Control of the drone by command packets, and the failsafe when they stop."""
 
 from __future__ import annotations
 
@@ -17,15 +17,15 @@ TIMEOUT = 0.25
 
 
 class Failsafe:
-    """Decides whether motors may turn: not after a silence, and not before a message that is disarmed.
+    """Decides whether motors may turn: not after a silence, and not before a disarmed message.
 
-    As with a radio's arming switch, being armed from the first message on, or again after a silence, is not enough.
+    As with a radio's arm switch, it is not enough to be armed from the first message on, or again after a silence.
 
     Args:
         timeout: s of silence.
 
     Attributes:
-        events: Silences so far that found the vehicle cleared to arm.
+        events: Number of silences so far while the vehicle was cleared to arm.
     """
 
     def __init__(self, timeout: float) -> None:
@@ -36,11 +36,11 @@ class Failsafe:
 
     @property
     def deadline(self) -> float:
-        """When motors are to be cut if nothing is heard until then, s; infinite if they are."""
+        """When motors are cut if nothing is heard until then, s; infinite if the vehicle is not cleared to arm."""
         return self._heard + self._timeout if self._cleared else math.inf
 
     def hear(self, armed: bool, time: float) -> bool:
-        """Note a valid message; return whether it may arm, or keep armed."""
+        """Note a valid message; return whether the vehicle may be armed."""
         self._heard = time
         if not armed:
             self._cleared = True
@@ -60,23 +60,23 @@ class Failsafe:
 
 
 class Controls(Protocol):
-    """What tells the vehicle what to do."""
+    """A receiver of the messages that control the vehicle."""
 
     @property
     def due(self) -> float:
-        """When there is something to do without a message, s of physics."""
+        """When `act` is to be called next, s of physics time."""
         ...
 
     def act(self, time: float) -> None:
-        """Do what is due by a time."""
+        """Do what is due at a time, s of physics time."""
         ...
 
     def take(self, data: bytes, time: float) -> bool:
-        """Take a datagram; return whether it was one to fly by."""
+        """Process a datagram; return whether it was accepted."""
         ...
 
     def summary(self) -> str:
-        """Say in a phrase what came in."""
+        """Return a phrase on what was received."""
         ...
 
 
@@ -84,14 +84,14 @@ class CommandReceiver:
     """Flies the vehicle by command packets (`hil.links.udp`).
 
     Args:
-        vehicle: Which.
+        vehicle: The vehicle.
         timeout: s, of `Failsafe`.
 
     Attributes:
-        received: Valid packets that were newer than any before.
-        lost: Packets that never came, by the gaps in the sequence.
-        stale: Valid packets that were not newer; they are ignored, so that none acts twice or late.
-        malformed: Messages that were no commands.
+        received: Number of valid packets that were newer than any before.
+        lost: Number of packets that never came, by the gaps in the sequence.
+        stale: Number of valid packets that were not newer; they are ignored, so that none acts twice or late.
+        malformed: Number of messages that were not commands.
         failsafe: Decides whether motors may turn.
     """
 
@@ -103,17 +103,17 @@ class CommandReceiver:
 
     @property
     def due(self) -> float:
-        """When motors are to be cut."""
+        """When motors are to be cut, s of physics time."""
         return self.failsafe.deadline
 
     def act(self, time: float) -> None:
-        """Cut the motors if nothing was heard for too long; then a sender may begin to count anew."""
+        """Cut the motors if nothing was heard for too long; then a sender may restart its sequence."""
         if self.failsafe.expire(time):
             self._newest = None
             self._vehicle.cut()
 
     def take(self, data: bytes, time: float) -> bool:
-        """Take a datagram; return whether the vehicle was given it."""
+        """Process a datagram; return whether the vehicle got its command."""
         packet = decode_command(data)
         if packet is None:
             self.malformed += 1
@@ -130,7 +130,7 @@ class CommandReceiver:
         return True
 
     def summary(self) -> str:
-        """Say what came in."""
+        """Return a phrase on what was received."""
         return (
             f"{self.received} commands ({self.lost} lost, {self.stale} stale, {self.malformed} malformed), "
             f"{self.failsafe.events} failsafe(s)"

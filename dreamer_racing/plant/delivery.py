@@ -1,4 +1,4 @@
-"""Poses on their way out, as motion capture and a network leave them: sampled, disturbed, late or lost."""
+"""Simulates the effects of motion capture and a network on poses: sampling, noise, delay and loss."""
 
 from __future__ import annotations
 
@@ -16,27 +16,27 @@ from dreamer_racing.settings import NOT_NEGATIVE, SHARE, Range, setting
 
 @dataclass
 class Delivery:
-    """What becomes of poses between the vehicle and whoever receives them."""
+    """Sampling, delay, loss and noise of poses between the vehicle and their receiver."""
 
     rate: float = setting(200.0, Range(10, 1000))  # Hz, at which poses are measured
     latency: float = setting(0.0, Range(0, 1))  # s, from a measurement to its departure
-    jitter: float = setting(0.0, Range(0, 1))  # s; uniform in [0, jitter] on top, so that packets may overtake others
-    packet_loss: float = setting(0.0, SHARE)  # share of packets that are never sent, each on its own
+    jitter: float = setting(0.0, Range(0, 1))  # s, more latency, uniform in [0, jitter]: packets may overtake others
+    packet_loss: float = setting(0.0, SHARE)  # share of packets that are lost, independently of each other
     position_noise: float = setting(0.0, Range(0, 1))  # m, standard deviation along each axis
     attitude_noise: float = setting(0.0, Range(0, 1))  # rad, standard deviation about each body axis
-    clock_offset: float = setting(0.0, Range(-1e9, 1e9))  # s, of the stamps' clock before that of the physics
-    seed: int = setting(0, NOT_NEGATIVE)  # of noise, jitter and loss
+    clock_offset: float = setting(0.0, Range(-1e9, 1e9))  # s, clock of the timestamps minus that of the physics
+    seed: int = setting(0, NOT_NEGATIVE)  # seed of noise, jitter and loss
 
 
 class PoseDelivery:
-    """Holds poses back until they are due.
+    """Delays pose packets until they are due.
 
     Args:
-        delivery: What becomes of them.
+        delivery: Sampling, delay, loss and noise.
 
     Attributes:
-        sent: Packets that left.
-        dropped: Packets that were lost instead.
+        sent: Number of packets that were sent.
+        dropped: Number of packets that were lost.
     """
 
     def __init__(self, delivery: Delivery) -> None:
@@ -48,16 +48,16 @@ class PoseDelivery:
 
     @property
     def next_measurement(self) -> float:
-        """When the next pose is to be measured, s of physics."""
+        """When the next pose is to be measured, s of physics time."""
         return self._measured / self._delivery.rate
 
     @property
     def next_departure(self) -> float:
-        """When the next packet is to leave, s of physics; infinite if none is waiting."""
+        """When the next packet is to be sent, s of physics time; infinite if none is waiting."""
         return self._waiting[0][0] if self._waiting else math.inf
 
     def measure(self, pose: Pose, time: float) -> None:
-        """Take the pose that is due at a time, s of physics, and send it off or lose it."""
+        """Measure the pose that is due at a time, s of physics time, and queue or lose its packet."""
         sequence, self._measured = self._measured, self._measured + 1
         delivery, random = self._delivery, self._random
         draws = random.standard_normal(6)
@@ -76,7 +76,7 @@ class PoseDelivery:
         heapq.heappush(self._waiting, (time + delay, sequence, encode_pose(packet)))
 
     def depart(self, time: float) -> list[bytes]:
-        """Return the packets that leave by a time, s of physics, in the order of departure."""
+        """Return the packets to be sent by a time, s of physics time, in order of departure."""
         leaving = []
         while self.next_departure <= time:
             leaving.append(heapq.heappop(self._waiting)[2])

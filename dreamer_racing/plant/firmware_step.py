@@ -1,7 +1,7 @@
-"""The loop, a plant and a real Betaflight firmware without a clock: a flight takes as long as it takes to compute.
+"""Runs flight loop, plant and a real Betaflight firmware in simulated time, as fast as they compute.
 
-The firmware is a process of its own in simulated time: each state packet lets one physics step pass in it. All packets
-are those of a flight in real time, but nothing depends on how busy the machine is, and a flight is the same each time.
+The firmware is a separate process in simulated time: each state packet lets one physics step pass in it. All packets
+are those of a flight in real time, but the result does not depend on the machine's load, and is reproducible.
 """
 
 from __future__ import annotations
@@ -24,20 +24,20 @@ from dreamer_racing.plant.process import Plant
 from dreamer_racing.plant.vehicle import PlantVehicle
 
 READY_AFTER = 1.5
-"""s that a firmware, which has booted, is told of a vehicle at rest before it is flown [choice]: it finds its level
-within 0.1 s and believes a radio after 0.6 s of valid channels (measured of 4.6.0)."""
+"""s for which a booted firmware receives the state of a vehicle at rest before it flies [choice]: it finds its level
+within 0.1 s and accepts a radio after 0.6 s of valid channels (measured with 4.6.0)."""
 
 _STEP_DONE = b"step"  # of `simulated_time.c`
 _PATIENCE = 20.0  # s for a step; it takes 0.1 ms
 
 
 class SteppedFirmware:
-    """A firmware in simulated time; a context that starts and stops it.
+    """A firmware in simulated time; a context manager that starts and stops it.
 
     Args:
-        program: Of `find_firmware`.
+        program: As returned by `find_firmware`.
         settings: Lines for its CLI.
-        step: s that each state packet lets pass.
+        step: s of simulated time per state packet.
 
     Attributes:
         firmware: The process.
@@ -58,10 +58,10 @@ class SteppedFirmware:
             raise
 
     def start(self) -> None:
-        """Start it anew, as it was set up."""
+        """Restart the firmware with its settings."""
         self.firmware.stop()
         self._motors.setblocking(False)
-        with suppress(BlockingIOError):  # what the last one has said
+        with suppress(BlockingIOError):  # what the last process has sent
             while True:
                 self._motors.recv(64)
         self._motors.settimeout(_PATIENCE)
@@ -69,16 +69,16 @@ class SteppedFirmware:
         self._take_step()
 
     def exchange(self, state: bytes) -> list[bytes]:
-        """Tell it of the vehicle, let a step pass, and return the motor packets that it sent.
+        """Send the vehicle's state, let a step pass, and return the motor packets that the firmware sent.
 
         Raises:
-            OSError: It has ended, or hangs.
+            OSError: The firmware has ended, or hangs.
         """
         self._out.sendto(state, ("127.0.0.1", self.firmware.ports.state))
         return self._take_step()
 
     def _take_step(self) -> list[bytes]:
-        """Return what it sends until a step, or its boot, is over."""
+        """Return the packets that the firmware sends until a step, or its boot, is over."""
         packets: list[bytes] = []
         while True:
             try:
@@ -91,11 +91,11 @@ class SteppedFirmware:
             packets.append(data)
 
     def hear(self, data: bytes) -> None:
-        """Give it a radio's packet; it takes it before the next step."""
+        """Send a radio's packet, which the firmware reads before the next step."""
         self._out.sendto(data, ("127.0.0.1", self.firmware.ports.channels))
 
     def close(self) -> None:
-        """Stop it, and give back the sockets."""
+        """Stop it, and close the sockets."""
         if hasattr(self, "firmware"):
             self.firmware.close()
         self._motors.close()
@@ -112,13 +112,13 @@ class SteppedFirmware:
 
 
 class Radio:
-    """A `Transport` of channels to a firmware that can be pulled out.
+    """A `Transport` of channels to a firmware, which can be disconnected.
 
     Args:
-        firmware: That hears it.
+        firmware: The receiving firmware.
 
     Attributes:
-        pulled: Whether what is written is lost.
+        pulled: Whether it is disconnected, so that packets are lost.
     """
 
     def __init__(self, firmware: SteppedFirmware) -> None:
@@ -126,7 +126,7 @@ class Radio:
         self.pulled = False
 
     def write(self, data: bytes) -> bool:
-        """Have the firmware hear a packet; it always went out, as far as a radio knows."""
+        """Send a packet to the firmware; report success even if disconnected, as a radio would."""
         if not self.pulled:
             self._firmware.hear(data)
         return True
@@ -139,17 +139,17 @@ class Radio:
         return iter(())
 
     def close(self) -> None:
-        """Do nothing: the firmware is its owner's."""
+        """Do nothing: the firmware's owner closes it."""
 
 
 class FirmwareStep(LockStep):
-    """A plant that a firmware flies by its motors, and the loop by a link to the firmware.
+    """A plant whose motors a firmware controls; the loop sends its commands to the firmware by a link.
 
     Args:
         vehicle: The drone.
-        firmware: That has been started; it has flown nothing else since.
-        link: To it.
-        delivery: What becomes of poses.
+        firmware: A firmware that was started, and has not flown since.
+        link: Link to the firmware.
+        delivery: Sampling, delay, loss and noise of poses.
 
     Attributes:
         disarmed_at: When its motors first stopped after they had turned, s of physics; None: never.
@@ -178,7 +178,7 @@ class FirmwareStep(LockStep):
         self.after_step()
 
     def get_ready(self, rate: float = 50.0) -> None:
-        """Let it find its level and its radio, which says that nothing is to turn, until it would arm."""
+        """Send disarmed commands until the firmware has found its level and its radio, and would arm."""
         for _ in range(round(READY_AFTER * rate)):
             self._link.send(at_rest())
             self.plant.advance_to(self.plant.time + 1.0 / rate)
@@ -186,11 +186,11 @@ class FirmwareStep(LockStep):
 
     @property
     def refusal(self) -> str:
-        """Why the firmware does not fly what it is told, as far as the link hears of it."""
+        """Why the firmware does not follow commands, as far as the link knows."""
         return self._link.refusal
 
     def listen(self) -> list[Reading]:
-        """Return what the link has heard."""
+        """Return the link's voltage readings."""
         return self._link.listen()
 
     def send(self, command: Command) -> bytes:

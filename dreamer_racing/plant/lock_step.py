@@ -1,6 +1,6 @@
-"""The loop and a plant in one process, without sockets or a clock: a flight takes as long as it takes to compute.
+"""Runs flight loop and plant in one process, without sockets or a clock, as fast as they compute.
 
-Packets are those of the real thing, and so is everything that reads them; only time is told by the plant's physics.
+Packets, and the code that reads them, are those of a real flight; only time is that of the plant's physics.
 """
 
 from __future__ import annotations
@@ -22,22 +22,22 @@ from dreamer_racing.plant.process import Plant
 from dreamer_racing.plant.vehicle import PlantVehicle
 
 BEGAN = 1000.0
-"""s, by the loop's clock, when the plant's physics began: two clocks that are told apart."""
+"""s, by the loop's clock, when the plant's physics began: not 0, so that mixing up the clocks shows."""
 
 ENABLE_AFTER = 0.5
 """s after which the operator gives the enable [choice]."""
 
 
 class LockStep:
-    """A plant as a `FlightLoop` sees it: its clock, its link, and where its poses and its operator's word come from.
+    """A plant with all that a `FlightLoop` needs: clock, link, pose source and operator.
 
     Args:
         vehicle: The drone.
-        delivery: What becomes of its poses.
+        delivery: Sampling, delay, loss and noise of its poses.
         failsafe: s without a command after which the plant cuts its motors.
 
     Attributes:
-        plant: The drone with its wires.
+        plant: The drone, with its controls and pose delivery.
         enable_after: s after which the operator gives the enable.
         killed: Whether the operator kills; settable.
     """
@@ -50,15 +50,15 @@ class LockStep:
 
     @property
     def elapsed(self) -> float:
-        """S of physics since it was made."""
+        """Physics time since construction, s."""
         return self.plant.time
 
     def now(self) -> float:
-        """Return s, by the loop's clock."""
+        """Return the time by the loop's clock, s."""
         return BEGAN + self.plant.time
 
     def sleep_until(self, deadline: float) -> None:
-        """Let the plant fly until then."""
+        """Let the plant fly until a time."""
         self.plant.advance_to(deadline - BEGAN)
 
     def send(self, command: Command) -> bytes:
@@ -69,26 +69,26 @@ class LockStep:
         return data
 
     def listen(self) -> list[Reading]:
-        """Return nothing: this vehicle does not speak of its battery."""
+        """Return nothing: this vehicle does not report its battery."""
         return []
 
     def feel(self) -> list[ImuReading]:
-        """Return what the plant's IMU tells now."""
+        """Return the present sample of the plant's IMU."""
         return [ImuReading(self.now(), self.plant.vehicle.feel())]
 
     @property
     def refusal(self) -> str:
-        """Nothing: this vehicle flies what it is told."""
+        """Empty: this vehicle follows all commands."""
         return ""
 
     def reckon_with(self, voltage: float) -> None:
-        """Do nothing: thrust is sent as it is."""
+        """Do nothing: thrust is sent in SI units."""
 
     def close(self) -> None:
-        """Do nothing: there is nothing to give back."""
+        """Do nothing: there is nothing to close."""
 
     def fly(self, chain: FlightChain, rate: float, duration: float, recorder: FlightRecorder | None = None) -> str:
-        """Fly until the flight is over, or for so many s; return why it ended."""
+        """Fly until the flight is over, or for ``duration`` s; return why it ended."""
         return FlightLoop(chain, self.poses, self.operator, self, rate, recorder, clock=self).run(
             duration, patience=duration
         )
@@ -102,7 +102,7 @@ class LockStep:
 
 
 class _Poses:
-    """Poses that have left the plant."""
+    """The source of the poses that the plant has sent."""
 
     def __init__(self) -> None:
         self.rejected = 0
@@ -131,6 +131,6 @@ class _Operator:
 
 
 def make_chain(flyer: Flyer, vehicle: PlantVehicle, config: ChainConfig) -> FlightChain:
-    """Make the chain of a flyer on the vehicle's track, with a camera if it needs one."""
+    """Make the flight chain of a flyer on the vehicle's track, with a camera if it needs one."""
     camera = None if flyer.camera is None else NoseCamera(vehicle.track, flyer.camera)
     return FlightChain(flyer, vehicle.track, config, camera)

@@ -1,4 +1,4 @@
-"""The scripted pilot as who flies a vehicle, by poses instead of images: the rest can be tried without an agent."""
+"""The scripted pilot as a flyer, by poses instead of images, to try all else without an agent."""
 
 from __future__ import annotations
 
@@ -23,9 +23,9 @@ class PilotFlyer:
 
     Args:
         track: To fly.
-        preset: Of the vehicle, as far as the pilot knows.
-        rate: Hz, of its choices.
-        limits: What the line may ask for; None for the pilot's own.
+        preset: Vehicle model that the pilot assumes.
+        rate: Hz, of its setpoints.
+        limits: Limits of the racing line; None for the pilot's own.
 
     Attributes:
         rate: As given.
@@ -52,11 +52,11 @@ class PilotFlyer:
         self._pilot.reset()
 
     def act(self, pose: Pose, image: np.ndarray | None, target_gate: int) -> Setpoint:
-        """Choose by the pose."""
+        """Return the setpoint for a pose."""
         parts = (pose.position, pose.attitude, pose.linear_velocity, pose.body_rates)
         position, attitude, velocity, rates = (torch.from_numpy(part)[None] for part in parts)
         action = self._pilot.act(position, attitude, velocity, rates, torch.tensor([target_gate]))[0].double().numpy()
         return Setpoint(self._thrust_scale * (1.0 + float(action[0])), self._rate_max * action[1:])
 
     def prepare(self) -> None:
-        """Nothing: where the vehicle will be is not known before."""
+        """Do nothing: the next pose is not known yet."""

@@ -1,7 +1,7 @@
-"""The process of a simulated drone: datagrams in and out, and physics that keeps to the clock.
+"""The process of a simulated drone: datagrams in and out, and physics that keeps up with a clock.
 
-`Plant` knows no clock: it is told how late it is. Two loops tell it: `fly_in_real_time` by the wall clock,
-`fly_in_lock_step` by the commands themselves.
+`Plant` has no clock. One of two loops advances it: `fly_in_real_time` by the wall clock, `fly_in_lock_step` by the
+commands.
 """
 
 from __future__ import annotations
@@ -31,10 +31,10 @@ from dreamer_racing.training.signals import GracefulExit
 logger = logging.getLogger(__name__)
 
 LATE = 0.005
-"""s behind the clock from which it counts as late [choice]: the time between two poses at 200 Hz."""
+"""s behind the clock from which an event counts as late [choice]: the time between two poses at 200 Hz."""
 
-_PATIENCE = 0.1  # s, between two looks at whether to stop
-_LONGEST = 2048  # bytes of a datagram that are read: more than any that means something
+_PATIENCE = 0.1  # s, between two checks of whether to stop
+_LONGEST = 2048  # bytes of a datagram that are read: more than any valid one has
 _ROUNDING = 1e-9  # s
 _PORT = Range(1, 65535)
 
@@ -44,39 +44,39 @@ class ProcessOptions:
     """Where a plant's datagrams go, and by which clock it flies."""
 
     host: str = "127.0.0.1"  # to listen on and to send to
-    command_port: int = setting(9101, Range(0, 65535))  # commands come in here; 0: a free one
-    pose_port: int = setting(9100, _PORT)  # poses go there
+    command_port: int = setting(9101, Range(0, 65535))  # port on which commands arrive; 0: a free one
+    pose_port: int = setting(9100, _PORT)  # port to which poses are sent
     failsafe: float = setting(TIMEOUT, Range(0.02, 10))  # s without a command after which motors are cut
-    speed: float = setting(1.0, Range(0.05, 20))  # s of physics in one of the wall clock
-    lock_step: bool = False  # no clock: each command flies one control step of the preset, each pose comes of one
+    speed: float = setting(1.0, Range(0.05, 20))  # s of physics per s of the wall clock
+    lock_step: bool = False  # no clock: only commands advance the physics, each by one control step of the preset
     duration: float | None = setting(None, POSITIVE)  # s of physics; null: until it is stopped
-    betaflight: str | None = None  # its release, as 4.6 or 2026.6: fly by the motors of a firmware (SITL), not commands
-    # auto, or a program: set up and start that firmware and fly by it; auto: BETAFLIGHT_SITL, or the extra sitl
+    betaflight: str | None = None  # release of a running firmware (SITL), as 4.6 or 2026.6: fly by its motors
+    # set up and start a firmware, and fly by its motors: its program, or auto: BETAFLIGHT_SITL, or the extra sitl
     firmware: str | None = None
-    motor_port: int = setting(MOTOR_PORT, Range(0, 65535))  # the firmware's motors come in here
-    state_port: int = setting(STATE_PORT, _PORT)  # the vehicle's state goes there
-    channel_port: int = setting(RC_PORT, _PORT)  # with firmware=: where that is to hear channels
+    motor_port: int = setting(MOTOR_PORT, Range(0, 65535))  # port on which the firmware's motor commands arrive
+    state_port: int = setting(STATE_PORT, _PORT)  # port to which the vehicle's state is sent
+    channel_port: int = setting(RC_PORT, _PORT)  # with firmware=: port on which it receives channels
     serial_port: int = setting(MSP_PORT, _PORT)  # with firmware=: its first serial port (TCP): MSP and CLI
 
 
 class Plant:
-    """A vehicle with what moves it and what becomes of its poses; all times are those of its physics.
+    """A vehicle with its controls and the delivery of its poses; all times are physics time.
 
     Args:
         vehicle: The drone.
-        controls: What tells it what to do.
-        delivery: What becomes of poses.
+        controls: Receives the messages that control it.
+        delivery: Sampling, delay, loss and noise of poses.
         send: Sends a pose packet.
-        incoming: By which whoever sent a command is told what the IMU tells, as often as poses are measured; None:
-            nobody is.
+        incoming: Socket by which the sender of commands gets IMU samples, as often as poses are measured; None: they
+            are not sent.
 
     Attributes:
-        commander: Address from which the last datagram came; None before it.
-        time: s, to which everything has been done.
+        commander: Address from which the last datagram came; None before the first.
+        time: s, to which physics has advanced.
         vehicle: The drone.
-        controls: What tells it what to do.
-        late: Events that were done more than `LATE` behind the clock.
-        latest: s, by how much at most.
+        controls: Receives the messages that control it.
+        late: Number of events that were more than `LATE` behind the clock.
+        latest: s, largest such delay.
     """
 
     def __init__(
@@ -96,11 +96,11 @@ class Plant:
 
     @property
     def due(self) -> float:
-        """When there is next something to do, s."""
+        """Time of the next event, s."""
         return min(self._poses.next_measurement, self._poses.next_departure, self.controls.due)
 
     def advance_to(self, until: float) -> None:
-        """Fly to a time, and do on the way what is due; a time that is past changes nothing."""
+        """Fly to a time, and handle the events on the way; a time that is past changes nothing."""
         while (due := self.due) <= until + _ROUNDING:
             self._fly_to(due)
             if self.controls.due <= due:
@@ -116,7 +116,7 @@ class Plant:
         if self._incoming is None or self.commander is None:
             return
         self._told += 1
-        with suppress(OSError):  # who listens no longer is no matter of the plant's
+        with suppress(OSError):  # a receiver that has gone does not concern the plant
             self._incoming.sendto(encode_imu(self._told, self.time, self.vehicle.feel()), self.commander)
 
     def _fly_to(self, until: float) -> None:
@@ -125,17 +125,17 @@ class Plant:
             self.time = until
 
     def take(self, data: bytes) -> bool:
-        """Take a datagram as it arrives; return whether it was one to fly by."""
+        """Process a datagram as it arrives; return whether it was accepted."""
         return self.controls.take(data, self.time)
 
     def note_delay(self, delay: float) -> None:
-        """Note that what is due is done so much behind the clock, s."""
+        """Note by how much an event is behind the clock, s."""
         if delay > LATE:
             self.late += 1
             self.latest = max(self.latest, delay)
 
     def summary(self) -> str:
-        """Say in a line what happened."""
+        """Return one line on what happened."""
         vehicle = self.vehicle
         laps = " ".join(f"{lap:.2f}" for lap in vehicle.lap_times)
         late = f", late {self.late} times (by {self.latest * 1e3:.0f} ms at most)" if self.late else ""
@@ -150,13 +150,13 @@ class Plant:
 def fly_in_real_time(
     plant: Plant, incoming: socket.socket, stop: GracefulExit, speed: float = 1.0, duration: float = math.inf
 ) -> None:
-    """Fly by the wall clock, counted from now: what is late is caught up with, and no delay adds to the next.
+    """Fly by the wall clock, counted from now; delays are caught up with, and do not add up.
 
     Args:
-        plant: What flies.
-        incoming: Datagrams for it.
-        stop: Ends it.
-        speed: s of physics in one of the clock.
+        plant: The plant.
+        incoming: Socket of datagrams for it.
+        stop: Ends the flight on request.
+        speed: s of physics per s of the clock.
         duration: s of physics.
     """
     start = time.monotonic() - plant.time / speed
@@ -165,7 +165,7 @@ def fly_in_real_time(
         plant.note_delay(-wait)
         if select.select([incoming], [], [], min(max(wait, 0.0), _PATIENCE))[0]:
             now = min((time.monotonic() - start) * speed, duration)
-            if now < plant.due + LATE * speed:  # else they came during what was late: as if at its beginning
+            if now < plant.due + LATE * speed:  # else physics is late: as if datagrams arrived at its present time
                 plant.advance_to(now)
             for data in _drain(plant, incoming):
                 plant.take(data)
@@ -176,13 +176,13 @@ def fly_in_real_time(
 def fly_in_lock_step(
     plant: Plant, incoming: socket.socket, stop: GracefulExit, period: float, duration: float = math.inf
 ) -> None:
-    """Fly without a clock: every command lets a control step pass, and nothing else does.
+    """Fly without a clock: only commands advance the physics, each by one period.
 
     Args:
-        plant: What flies.
-        incoming: Commands for it.
-        stop: Ends it.
-        period: s of physics that a command lets pass.
+        plant: The plant.
+        incoming: Socket of commands for it.
+        stop: Ends the flight on request.
+        period: s of physics per command.
         duration: s of physics.
     """
     while not stop.requested and plant.time < duration - _ROUNDING:
@@ -193,7 +193,7 @@ def fly_in_lock_step(
 
 
 def _drain(plant: Plant, incoming: socket.socket) -> list[bytes]:
-    """Return the datagrams that wait, as many as there is time for, and let the plant know who sent them."""
+    """Return the waiting datagrams, up to 256, and note in the plant who sent the last one."""
     received: list[bytes] = []
     while len(received) < 256:
         try:
@@ -205,7 +205,7 @@ def _drain(plant: Plant, incoming: socket.socket) -> list[bytes]:
 
 
 def check_process(options: ProcessOptions) -> None:
-    """Refuse ways to fly that exclude each other.
+    """Refuse options that exclude each other.
 
     Raises:
         ValueError: The message names the settings.
@@ -226,16 +226,16 @@ def check_process(options: ProcessOptions) -> None:
 
 
 def by_firmware(options: ProcessOptions) -> str | None:
-    """Return the setting that says that a firmware's motors fly it; None if none does."""
+    """Return the name of the option that selects flight by a firmware's motors; None if none does."""
     return next((name for name in ("betaflight", "firmware") if getattr(options, name) is not None), None)
 
 
 class Sockets(NamedTuple):
-    """The ways in and out.
+    """The sockets of a plant.
 
     Args:
         incoming: Commands, or the firmware's motors.
-        poses: To whoever flies it.
+        poses: To the receiver of poses.
         state: To the firmware.
     """
 
@@ -244,13 +244,13 @@ class Sockets(NamedTuple):
     state: UdpTransport
 
     def close(self) -> None:
-        """Give back all ports."""
+        """Close all sockets."""
         for end in self:
             end.close()
 
 
 def open_sockets(options: ProcessOptions) -> Sockets:
-    """Open what a plant needs.
+    """Open the sockets of a plant.
 
     Raises:
         ValueError: The options exclude each other.
@@ -268,13 +268,13 @@ def start_firmware(named: str, options: ProcessOptions, sockets: Sockets, settin
 
     Args:
         named: Its program, or ``auto``, see `find_firmware`.
-        options: Where it is reached.
-        sockets: Of these options.
+        options: Its ports and, if given, its release.
+        sockets: Opened for these options.
         settings: Lines for its CLI.
 
     Raises:
         ValueError: It is of another release than ``betaflight=``.
-        OSError: There is none, or it does not start.
+        OSError: There is no firmware, or it does not start.
     """
     program = find_firmware(None if named == "auto" else named)
     motors = int(sockets.incoming.getsockname()[1])
@@ -301,17 +301,17 @@ def run(
     sockets: Sockets,
     firmware: Firmware | None = None,
 ) -> Plant:
-    """Fly until it is stopped by SIGINT or SIGTERM, or its time is up, and log a line of what happened.
+    """Fly until SIGINT, SIGTERM or the end of the duration, and log a line on what happened.
 
     Args:
         vehicle: The drone.
-        delivery: What becomes of its poses.
+        delivery: Sampling, delay, loss and noise of its poses.
         options: By which clock it flies, and by which firmware.
-        sockets: Of these options; they are closed at the end.
-        firmware: That was started for it; it is stopped at the end.
+        sockets: Opened for these options; they are closed at the end.
+        firmware: One that was started for it; it is stopped at the end.
 
     Returns:
-        What has flown.
+        The plant that has flown.
     """
     controls: Controls = CommandReceiver(vehicle, options.failsafe)
     release = options.betaflight if firmware is None else firmware.release

@@ -1,4 +1,4 @@
-"""How much a vehicle may differ from the one that a flyer was trained on: flights with one thing changed at a time."""
+"""Measures how much a vehicle may differ from a flyer's training model: flights with one parameter changed each."""
 
 from __future__ import annotations
 
@@ -18,37 +18,37 @@ from dreamer_racing.plant.vehicle import Mismatch, PlantVehicle
 
 SWEEPS: dict[str, tuple[float, ...]] = {
     "delay": (0.0, 0.02, 0.04, 0.06, 0.08, 0.1),  # s, of commands
-    "latency": (0.0, 0.002, 0.005, 0.01, 0.02, 0.05, 0.1),  # s, of poses, of which the loop is not told
+    "latency": (0.0, 0.002, 0.005, 0.01, 0.02, 0.05, 0.1),  # s, of poses, not known to the loop
     "mass": (0.8, 0.9, 1.0, 1.1, 1.2),  # relative
     "thrust": (0.8, 0.9, 1.0, 1.1, 1.2),  # relative
     "position_noise": (0.0, 0.01, 0.02, 0.05, 0.1),  # m, standard deviation
     "rate": (50.0, 100.0, 200.0, 400.0),  # Hz, of poses
 }
-"""What is changed, and the values that it takes; field names of `Mismatch` and `Delivery`."""
+"""Values of each changed parameter, by its field name in `Mismatch` or `Delivery`."""
 
 USUAL = Delivery(rate=200.0, jitter=0.002, packet_loss=0.01, position_noise=0.001, attitude_noise=0.003)
 """Poses as a motion-capture system gives them [choice]; without noise every flight would be the same."""
 
 LONGEST = 60.0
-"""s after which a flight is given up."""
+"""s after which a flight is ended."""
 
 LIMITS = {"speed_max": 25.0, "velocity_tolerance": 20.0}
-"""m/s, the limits of safety that are not its own: the pilot is faster than a first flight should be, and the
-question is how much noise a flyer stands, not safety."""
+"""m/s, safety limits that differ from the defaults: the pilot is faster than a first flight should be, and the study
+measures how much noise a flyer tolerates, not safety."""
 
 
 class StudyFlight(NamedTuple):
-    """What came of a flight.
+    """The result of a flight.
 
     Args:
-        sweep: Name of what was changed.
-        value: To what.
-        seed: Of the poses' noise.
-        gates: Passed in order, by the plant's own count.
+        sweep: Name of the changed parameter.
+        value: Its value.
+        seed: Seed of the poses' noise.
+        gates: Number of gates passed in order, as counted by the plant.
         finished: Whether all laps were flown.
-        lap_time: Mean of the laps, s; None without one.
+        lap_time: Mean lap time, s; None without a lap.
         speed_max: m/s.
-        ended: Why, in words.
+        ended: Why it ended, in words.
     """
 
     sweep: str
@@ -69,15 +69,15 @@ def study(
     sweeps: Sequence[str] = tuple(SWEEPS),
     processes: int = 1,
 ) -> Iterator[StudyFlight]:
-    """Fly every value of every sweep so many times, and yield what came of each, in order.
+    """Fly every value of every sweep ``flights`` times, and yield the results, in order.
 
     Args:
-        make_flyer: Makes who flies; called once in each process, so it must be picklable.
-        track: On which all are flown.
+        make_flyer: Makes the flyer; called once in each process, so it must be picklable.
+        track: Track of all flights.
         preset: Physics of the vehicle before it is changed.
-        flights: Of each value, with different noise.
-        sweeps: Names out of `SWEEPS`.
-        processes: How many fly at a time.
+        flights: Number of flights of each value, with different noise.
+        sweeps: Names in `SWEEPS`.
+        processes: Number of parallel processes.
     """
     jobs = [(sweep, value, seed) for sweep in sweeps for value in SWEEPS[sweep] for seed in range(flights)]
     with ProcessPoolExecutor(
@@ -87,7 +87,7 @@ def study(
 
 
 _prepared: dict[str, Any] = {}
-"""Of this process: the flyer takes seconds to make."""
+"""Flyer, track and preset of this process, kept because a flyer takes seconds to make."""
 
 
 def _prepare(make_flyer: Callable[[], Flyer], track: Track, preset: str) -> None:
@@ -99,7 +99,7 @@ def _fly(sweep: str, value: float, seed: int) -> StudyFlight:
 
 
 def fly(flyer: Flyer, track: Track, preset: str, sweep: str, value: float, seed: int) -> StudyFlight:
-    """Fly once with one thing changed."""
+    """Fly once with one parameter changed."""
     mismatch, delivery = Mismatch(), dataclasses.replace(USUAL, seed=seed)
     for changed in (mismatch, delivery):
         if hasattr(changed, sweep):
@@ -127,13 +127,13 @@ def fly(flyer: Flyer, track: Track, preset: str, sweep: str, value: float, seed:
 
 
 class _Fastest(LockStep):
-    """Notes the highest speed, m/s."""
+    """A `LockStep` that notes the highest speed, m/s."""
 
     speed_max = 0.0
 
     def sleep_until(self, deadline: float) -> None:
         super().sleep_until(deadline)
         if not self.plant.vehicle.armed:
-            return  # what falls once it is over is no flight
+            return  # a fall after the flight does not count
         velocity = self.plant.vehicle.pose().linear_velocity
         self.speed_max = max(self.speed_max, float((velocity @ velocity) ** 0.5))

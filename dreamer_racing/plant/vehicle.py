@@ -1,4 +1,4 @@
-"""One drone of this project's own physics, not quite the one that a policy was trained on.
+"""One drone of this project's physics, which may differ from the one that a policy was trained on.
 
 SI units, world z up, body frame FLU, attitude wxyz.
 """
@@ -27,30 +27,30 @@ from dreamer_racing.settings import Range, setting
 logger = logging.getLogger(__name__)
 
 LIFT_OFF = 0.5
-"""Share of its weight that a drone must be asked to carry before the stand lets go [choice]."""
+"""Share of a drone's weight that commanded thrust must exceed before the stand releases it [choice]."""
 
 BEARS_ITSELF = 0.99
-"""Share of its weight that a drone must be asked for, as long, before the stand bears it no more: hover, rounded."""
+"""Share of a drone's weight that must be commanded, as long, before the stand lets it sink: hover thrust, rounded."""
 
 STAND_RADIUS = 0.1
-"""m from its start, sideways, within which the stand bears a drone that it has let go [choice]."""
+"""m from its start, sideways, within which the stand supports a released drone [choice]."""
 
 SPIN_UP = 5.0
-"""Motor lags for which it must be asked that: rotors then give 98.7 % of the thrust that they are to [choice]."""
+"""Motor lags for which that thrust must be commanded: rotors then give 98.7 % of it [choice]."""
 
 
 @dataclass
 class Mismatch:
     """How a drone differs from the nominal one of its preset."""
 
-    mass: float = setting(1.0, Range(0.5, 2.0))  # relative; the flight controller reckons with the nominal one
-    thrust: float = setting(1.0, Range(0.4, 2.0))  # relative, of all rotors: battery voltage
+    mass: float = setting(1.0, Range(0.5, 2.0))  # relative; the flight controller assumes the nominal one
+    thrust: float = setting(1.0, Range(0.4, 2.0))  # relative, of all rotors, as with another battery voltage
     drag: float = setting(1.0, Range(0.0, 10.0))  # relative
     motor_lag: float | None = setting(None, Range(0.001, 0.5))  # s, first order on rotor speed; null: the preset's
-    delay: float | None = setting(None, Range(0.0, 0.5))  # s, from a command to what acts on it; null: the preset's
+    delay: float | None = setting(None, Range(0.0, 0.5))  # s, from a command to its effect; null: the preset's
 
     def apply(self, nominal: QuadrotorParameters) -> QuadrotorParameters:
-        """Return the parameters of the drone that differs so from a nominal one."""
+        """Return the parameters of a nominal drone with these differences."""
         x, y, z = nominal.drag
         return replace(
             nominal,
@@ -66,27 +66,27 @@ class Mismatch:
 class PlantVehicle:
     """A drone that takes commands and flies, until it crashes.
 
-    It begins on a stand at the track's start pose, which holds it until it has been armed and asked for more than half
-    of its weight for as long as its rotors take to spin up (`LIFT_OFF`, `SPIN_UP`): at hover it then stays where it is.
-    Until it has been asked for all of its weight for as long, it may slide off the stand (`STAND_RADIUS`), but not sink
-    through it. A lap is timed from there. Passes and crashes are those of `Race`, judged once a control step of the
-    preset; after a crash the motors are off for good, and what is in the air falls to the ground and stays.
+    It begins on a stand at the track's start pose, which holds it until it is armed and commanded to more than half of
+    its weight for as long as its rotors take to spin up (`LIFT_OFF`, `SPIN_UP`); at hover thrust it then stays there.
+    Until it is commanded to its full weight for as long, it may slide off the stand (`STAND_RADIUS`), but not sink
+    through it. Laps are timed from the release. Passes and crashes are those of `Race`, checked once a control step of
+    the preset; after a crash the motors are off for good, and the drone falls to the ground and stays there.
 
     Args:
         track: Name, path, or a `Track`.
         preset: Name of the nominal drone's physics, or its parameters; without their randomisation.
-        mismatch: How this one differs.
+        mismatch: Differences of this drone from it.
 
     Attributes:
         track: The track.
-        parameters: The drone's own.
-        control_dt: s, a control step of the preset.
-        time: s, of physics since it was made; a reset does not turn it back.
-        armed: Whether motors may turn, by the command that acts now.
+        parameters: Parameters of this drone.
+        control_dt: Control step of the preset, s.
+        time: Physics time since construction, s; a reset does not change it.
+        armed: Whether motors may turn, by the command now in effect.
         on_stand: Whether the stand still holds it.
         crash: Why it crashed; `CrashCause.NONE` while it has not.
-        fate: The same in words, with whether it was disarmed then, and fell only because of that.
-        gates_passed: In order, since it was last on the stand.
+        fate: The same in words, with its time and whether the drone was disarmed then.
+        gates_passed: Number of gates passed in order since it was last on the stand.
         lap_times: s, of the laps since then.
 
     Raises:
@@ -118,14 +118,14 @@ class PlantVehicle:
         self._build()
         self._spin_up_steps = round(SPIN_UP * self.parameters.motor_time_constant / self.parameters.physics_dt)
         self._steps = 0
-        self._until = 0.0  # s, to which physics was asked to go
+        self._until = 0.0  # s, requested physics time
         self.reset()
 
     def _build(self) -> None:
-        """Make the engine, and the two ways to fly in it: by commands, and by rotor speeds."""
+        """Build the simulation, and the two ways to fly in it: by commands, and by rotor speeds."""
         own = self.parameters
         model = build_drone(own).compile()
-        model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_AUTORESET  # a broken state is for the race to see
+        model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_AUTORESET  # the race detects a broken state
         data = mujoco.MjData(model)
 
         def integrate() -> None:
@@ -133,11 +133,11 @@ class PlantVehicle:
 
         self._qpos, self._qvel = data.qpos, data.qvel
         qpos, qvel, force = (torch.from_numpy(array[None]) for array in (data.qpos, data.qvel, data.qfrc_applied))
-        # a command may change at any physics step, and its delay is kept here: armed or not is delayed with it
+        # a command may change at any physics step; this class delays it, and arming with it
         controller = Quadrotor(replace(own, control_dt=own.physics_dt, command_delay=0.0), 1)
         bare = replace(controller.parameters, motor_time_constant=math.inf, motor_lag_of="speed", betaflight=None)
         rotors = Quadrotor(bare, 1)
-        rotors.rotor_speed = controller.rotor_speed  # with an endless lag they stay what they are set to
+        rotors.rotor_speed = controller.rotor_speed  # with an infinite lag they stay as set
         self._by_commands = FusedFlight(controller, qpos, qvel, force, integrate)
         self._by_rotors = FusedFlight(rotors, qpos, qvel, force, integrate)
         self._setpoint = controller.setpoints[0, 0].numpy()  # (4,) N and rad/s
@@ -149,13 +149,13 @@ class PlantVehicle:
         """Put the drone back on the stand: whole, disarmed, rotors at rest, with no gate passed."""
         yaw = 0.5 * math.radians(self.track.start_yaw_degrees)
         self._start = np.array((*self.track.start_position, math.cos(yaw), 0.0, 0.0, math.sin(yaw)))
-        self._pending: deque[tuple[int, Command]] = deque()  # commands, and the physics step from which they act
-        self._target_speed: np.ndarray | None = None  # (4,) √N, of rotors that another flight controller commands
+        self._pending: deque[tuple[int, Command]] = deque()  # physics step from which a command acts, and the command
+        self._target_speed: np.ndarray | None = None  # (4,) √N, commanded by an external flight controller
         self._acceleration = np.zeros(3)
         self._lift_off_step: int | None = None
         self.on_stand, self.gates_passed = True, 0
-        self._bears = True  # whether the stand keeps it from sinking, be it let go
-        self._bore_itself = 0  # physics steps in a row in which it was asked for all of its weight
+        self._bears = True  # whether the stand keeps it from sinking, even after release
+        self._bore_itself = 0  # consecutive physics steps with commanded thrust of its full weight
         self.crash, self.fate = CrashCause.NONE, "none"
         self.lap_times: list[float] = []
         self._rotor_speed[:], self.armed = 0.0, False
@@ -165,27 +165,27 @@ class PlantVehicle:
 
     @property
     def time(self) -> float:
-        """Seconds of physics since it was made."""
+        """Physics time since construction, s."""
         return self._steps * self.parameters.physics_dt
 
     @property
     def specific_force(self) -> np.ndarray:
-        """What an accelerometer in its centre shows: (3,) m/s², body frame, +9.81 upwards at rest."""
+        """Reading of an accelerometer at its centre: (3,) m/s², body frame, +9.81 upwards at rest."""
         rotation = np.zeros(9)
         mujoco.mju_quat2Mat(rotation, self._qpos[3:])
         return rotation.reshape(3, 3).T @ (self._acceleration + np.array((0.0, 0.0, GRAVITY)))
 
     def feel(self) -> np.ndarray:
-        """What an IMU in its centre tells: (6,) body rates, rad/s, and specific force, m/s², body frame."""
+        """Return the sample of an IMU at its centre: (6,) body rates, rad/s, and specific force, m/s², body frame."""
         return np.concatenate((self._qvel[3:], self.specific_force))
 
     def pose(self) -> Pose:
-        """Return where it is and how it moves, at its own `time`."""
+        """Return its pose and velocities at its own `time`."""
         numbers = (self._qpos[:3], self._qpos[3:], self._qvel[:3], self._qvel[3:])
         return Pose(self.time, *(array.copy() for array in numbers))
 
     def command(self, command: Command) -> None:
-        """Take a command, which acts after the drone's delay; body rates beyond the flight controller's are clipped.
+        """Queue a command, which acts after the drone's delay; body rates are clipped to the flight controller's.
 
         Raises:
             ValueError: It is not finite.
@@ -196,10 +196,10 @@ class PlantVehicle:
         self._pending.append((self._steps + delay, command))
 
     def turn_rotors(self, motors: np.ndarray) -> None:
-        """Take the motor commands of a flight controller that is not this one's own, without delay.
+        """Apply the motor commands of an external flight controller, without delay.
 
         Args:
-            motors: (4,) in [0, 1], in Betaflight's order; thrust goes with their square. Armed: any of them above 0.
+            motors: (4,) in [0, 1], in Betaflight's order; thrust goes with their square. Any above 0 means armed.
         """
         self.armed = bool((motors > 0.0).any())
         self._target_speed = motors * math.sqrt(self.parameters.rotor_thrust_max)
@@ -211,16 +211,16 @@ class PlantVehicle:
         self._act(at_rest())
 
     def advance(self, seconds: float) -> None:
-        """Let time pass: whole physics steps, of which none is lost if calls ask for parts of one."""
+        """Advance by whole physics steps; fractions of a step carry over to later calls."""
         self._until += seconds
         step = self.parameters.physics_dt
         for _ in range(math.floor(self._until / step + 1e-6) - self._steps):
             self._step()
 
     def _act(self, command: Command) -> None:
-        """Let the flight controller do as it is told; it reckons with the nominal mass and thrust."""
+        """Apply a command; the flight controller assumes the nominal mass and full thrust."""
         if command.armed and not self.armed and self._rate_loop is not None:
-            self._rate_loop.reset(torch.ones(1, 1, dtype=torch.bool))  # nothing is integrated before
+            self._rate_loop.reset(torch.ones(1, 1, dtype=torch.bool))  # integrators start at zero
         self.armed = command.armed
         limits = self.parameters.body_rate_max
         thrust = max(command.setpoint.collective_thrust, 0.0) * self._nominal_mass * self._differs.thrust
@@ -228,7 +228,7 @@ class PlantVehicle:
         self._setpoint[1:] = np.clip(command.setpoint.body_rates, np.negative(limits), limits)
 
     def _step(self) -> None:
-        """Make one physics step, and see to what holds the drone."""
+        """Make one physics step, and apply stand, race and ground."""
         while self._pending and self._pending[0][0] <= self._steps:
             self._act(self._pending.popleft()[1])
         self._steps += 1
@@ -248,21 +248,21 @@ class PlantVehicle:
             if self._bears:
                 self._maybe_bear()
             self._judge()
-        elif not self._qpos[2] > GROUND_HEIGHT:  # nor if it is no number
+        elif not self._qpos[2] > GROUND_HEIGHT:  # also true of NaN
             self._lie()
         self._acceleration = (self._qvel[:3] - before) / self.parameters.physics_dt
 
     def _turn_and_step(self) -> None:
-        """Make a physics step with rotors that follow their own commands, or run down."""
+        """Make a physics step with rotors that follow external commands, or run down."""
         given = self._target_speed if self.crash is CrashCause.NONE else None
         target = np.zeros(4) if given is None else given
         speed = self._rotor_speed.copy()
-        self._rotor_speed[:] = self._follow(target, speed, math.sqrt(self._decay))  # of the step's middle
+        self._rotor_speed[:] = self._follow(target, speed, math.sqrt(self._decay))  # at the step's middle
         self._by_rotors.step(0)
         self._rotor_speed[:] = self._follow(target, speed, self._decay)
 
     def _follow(self, target: np.ndarray, speed: np.ndarray, decay: float) -> np.ndarray:
-        """Return speeds (4,) in √N on their way to a target, when so much of the way is left."""
+        """Return speeds (4,) in √N on their way to a target, with the share ``decay`` of the way left."""
         if self.parameters.motor_lag_of == "speed":
             return target + decay * (speed - target)
         return np.sqrt(target**2 + decay * (speed**2 - target**2))
@@ -272,16 +272,16 @@ class PlantVehicle:
         self._qpos[:], self._qvel[:] = place, 0.0
 
     def _lie(self) -> None:
-        """Keep what has fallen on the ground, as it fell; where it broke if its state was lost."""
+        """Keep a fallen drone on the ground where it fell, or at the start if its state is not finite."""
         place = self._qpos if np.isfinite(self._qpos).all() else self._start
         self._hold(np.array((*place[:2], GROUND_HEIGHT, *place[3:])))
 
     def _asked(self) -> float:
-        """Return the thrust that it is asked for, N."""
+        """Return the commanded thrust, N."""
         return float(self._setpoint[0] if self._target_speed is None else np.square(self._target_speed).sum())
 
     def _maybe_let_go(self) -> None:
-        """Let the drone go once it has been asked to carry itself for long enough."""
+        """Release the drone once enough thrust has been commanded for long enough."""
         if not (self.armed and self._asked() > LIFT_OFF * self.parameters.mass * GRAVITY):
             self._lift_off_step = None
             return
@@ -294,14 +294,14 @@ class PlantVehicle:
             logger.info("plant: the stand let go at %.2f s", self.time)
 
     def _maybe_bear(self) -> None:
-        """Keep what has been let go, and does not bear itself yet, from sinking through the stand."""
+        """Keep a released drone that does not carry its weight yet from sinking through the stand."""
         away = self._qpos[:3] - self._start[:3]
         self._bears = self._bore_itself < self._spin_up_steps and math.hypot(*away[:2]) < STAND_RADIUS
         if self._bears and away[2] < 0.0:
             self._qpos[2], self._qvel[2] = self._start[2], max(self._qvel[2], 0.0)
 
     def _judge(self) -> None:
-        """Keep the path of a control step, and at its end have it judged."""
+        """Record the path of a control step, and let the race check it at the end."""
         self._path.append(self._qpos[:3].copy())
         if len(self._path) <= round(self.control_dt / self.parameters.physics_dt):
             return

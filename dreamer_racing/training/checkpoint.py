@@ -1,14 +1,14 @@
 """Checkpoints of a run: crash-safe saving and restoring.
 
 A checkpoint is a folder ``<run_dir>/checkpoints/checkpoint-<env_steps>`` in the format of `torchrl.checkpoint`. It is
-written beside its final place and renamed into it, so that a folder of that name is always complete; what a killed
-process leaves behind has a name with a leading dot, is never read, and is removed by the next run. The CRC-32 of every
-file lies beside them and is compared before anything is read.
+written under another name and then renamed, so that a folder of that name is always complete; what a killed process
+leaves behind has a name with a leading dot, is never read, and is removed by the next run. The CRC-32 of every file is
+stored in the checkpoint and compared before anything is read.
 
-Where several processes train together (`parallel`), a checkpoint is of all of them: the first one's parts lie
-where a single one's do, and what each of the others has of its own (worlds, replay, random state) lies below
-``process-<n>``, written by itself. Any number of processes can restore it: what is common they all read, and what they
-have of their own is read back if they are as many as before; else the replay is dealt anew, and the rest begins anew.
+If several processes train together (`parallel`), a checkpoint holds the state of all of them: rank 0 writes its parts
+as a single process does, and each other process writes its own parts (environments, replay, random state) below
+``process-<n>``. Any number of processes can restore it: all read the shared parts; each reads its own ones if their
+number is as before, else the replay streams are redistributed, and the other own parts start afresh.
 """
 
 from __future__ import annotations
@@ -45,11 +45,11 @@ logger = logging.getLogger(__name__)
 
 
 class RunCheckpointError(CheckpointError, ValueError):
-    """A checkpoint that cannot be written, or not be read for what it is wanted; the message says what to do."""
+    """Raised if a checkpoint cannot be written or restored; the message says what to do."""
 
 
 class RandomState(GlobalRNGState):
-    """State of the Python, NumPy and torch generators; that of devices absent here is skipped with a warning."""
+    """State of the Python, NumPy and torch generators; CUDA's is skipped if the number of devices differs."""
 
     def load_state_dict(self, state_dict: Mapping[str, Any]) -> None:
         """Restore what `state_dict` returned."""
@@ -71,16 +71,16 @@ class RunCheckpoints:
 
     A part has ``dump(path)``/``load(path)`` (a replay), or ``state_dict()``/``load_state_dict(state)`` of tensors and
     plain Python values (learner, optimiser, curriculum), or is a dictionary of JSON values, restored in place
-    (counters). The random state of Python, NumPy and torch is always saved with them, as the part ``random_state``.
+    (counters). The random state of Python, NumPy and torch is always saved, too, as the part ``random_state``.
 
-    One run at a time may write below a run directory.
+    Only one run at a time may write to a run directory.
 
     Args:
-        run_dir: folder of the run; checkpoints go to its subfolder ``checkpoints``.
-        components: the parts by name.
-        keep_last: checkpoints kept.
-        own: which of them each of several processes has of its own, beside the random state. Then all of them must save
-            and load together. Empty: the first one's are all there is, and it saves alone.
+        run_dir: Folder of the run; checkpoints go to its subfolder ``checkpoints``.
+        components: Parts by name.
+        keep_last: Number of checkpoints kept.
+        own: Names of the parts that differ between processes, besides the random state; if there are any, all processes
+            must save and load together. If empty, rank 0 saves alone.
 
     Example:
         >>> counters = {"env_steps": 0}
@@ -94,7 +94,7 @@ class RunCheckpoints:
     ) -> None:
         self.directory = RunDirectory(Path(run_dir).absolute()).checkpoints
         self.components = components
-        self._own_names = frozenset(own)  # also of parts that the other processes alone have
+        self._own_names = frozenset(own)  # also of parts that only other processes have
         self._own = {name: components[name] for name in own if name in components}
         self._checkpoint = _bind({**components, "random_state": RandomState()})
         self._keep_last = keep_last
@@ -104,14 +104,14 @@ class RunCheckpoints:
             remove_unfinished(self.directory)
 
     def save(self, env_steps: int, metadata: Mapping[str, Any] | None = None) -> Path:
-        """Saves all parts and removes the oldest checkpoints beyond ``keep_last``.
+        """Save all parts, and remove the oldest checkpoints beyond ``keep_last``.
 
-        Checkpoints of more ``env_steps`` are removed too: they belong to a run that this one, resumed from before
-        them, replaces. A second save at the same ``env_steps`` does nothing.
+        Checkpoints with more ``env_steps`` are removed, too: they belong to the run that this one replaces, because it
+        was resumed from an earlier checkpoint. A second save at the same ``env_steps`` does nothing.
 
         Args:
-            env_steps: control steps summed over environments, which names the checkpoint.
-            metadata: JSON values, kept in the manifest.
+            env_steps: Control steps summed over environments; part of the checkpoint's name.
+            metadata: JSON values to store in the manifest.
 
         Returns:
             The checkpoint's folder.
@@ -142,12 +142,12 @@ class RunCheckpoints:
             try:
                 self._remove_later(final)
                 self._remove_oldest()
-            except OSError as error:  # what was asked for is done
+            except OSError as error:  # the checkpoint itself is complete
                 logger.warning("Checkpoints beside %s that are not kept could not be removed: %s.", final.name, error)
         return final
 
     def _step(self, action: Callable[[], object], of_this_process: bool) -> None:
-        """Do one step of a save, if it is this process's; where all save together, wait for the others to do theirs."""
+        """Run a step of a save if it is this process's; if all save together, wait for the others."""
         action = action if of_this_process else lambda: None
         if self._own:
             parallel.together(action)
@@ -155,7 +155,7 @@ class RunCheckpoints:
             action()
 
     def _save_own(self, checkpoint: Path) -> None:
-        """Save what this process has of its own into a checkpoint that the first one has begun."""
+        """Save this process's own parts into the checkpoint that rank 0 has begun."""
         _bind({**self._own, "random_state": RandomState()}).save(checkpoint / f"{PROCESS}{parallel.rank()}")
 
     def load(
@@ -164,14 +164,14 @@ class RunCheckpoints:
         map_location: torch.device | str = "cpu",
         may_lack: Collection[str] = (),
     ) -> dict[str, Any]:
-        """Restores all parts.
+        """Restore all parts.
 
-        A damaged checkpoint is passed over for the one before it, and this is logged with what is lost.
+        If a checkpoint is damaged, the one before it is restored; what is lost is logged.
 
         Args:
-            path: run directory, folder of checkpoints, or one checkpoint; this run's latest if None.
-            map_location: device that tensors are read to before the parts copy them to their own.
-            may_lack: parts that checkpoints of older versions do not have; they are left as they are.
+            path: Run directory, folder of checkpoints, or one checkpoint; this run's latest if None.
+            map_location: Device that tensors are read to before the parts copy them to their own.
+            may_lack: Parts that the checkpoint may lack; they are left as they are then.
 
         Returns:
             The metadata of the checkpoint, with ``env_steps``.
@@ -199,9 +199,9 @@ class RunCheckpoints:
         return metadata
 
     def _deal(self, source: Path, saved: int) -> None:
-        """Deal replays that another number of processes saved; the first takes the last streams, which may be held out.
+        """Redistribute the streams of replays that another number of processes saved.
 
-        So does a single process, whose streams are all in one piece: the order of pieces is that of falling ranks.
+        Streams are ordered by descending rank, so that rank 0 gets the last ones, which may be held out.
         """
         for name, part in self._own.items():
             if not hasattr(part, "deal"):
@@ -239,24 +239,24 @@ class BestCheckpoint:
     """Keeps the parts as they were at the best evaluation so far, below ``<run_dir>/best``.
 
     Args:
-        run_dir: folder of the run.
-        components: as of `RunCheckpoints`.
-        env_steps: where the run goes on. What is kept of a later evaluation is of flights that are to be flown again,
-            perhaps otherwise: it is moved to ``<run_dir>/best.replaced``.
+        run_dir: Folder of the run.
+        components: As for `RunCheckpoints`.
+        env_steps: env_steps at which the run starts or resumes. A best checkpoint of later env_steps belongs to a part
+            of the run that is now repeated: it is moved to ``<run_dir>/best.replaced``.
 
     Attributes:
-        score: of the evaluation whose parts are kept; None before the first.
+        score: Score of the evaluation whose parts are kept; None before the first.
     """
 
     def __init__(self, run_dir: str | Path, components: Mapping[str, Any], env_steps: int) -> None:
         self.directory = RunDirectory(Path(run_dir).absolute()).best.path
         self.score: float | None = None
-        if parallel.is_first():  # who alone offers, and writes there
+        if parallel.is_first():  # only rank 0 calls `offer` and writes there
             self._find(env_steps)
         self._checkpoints = RunCheckpoints(self.directory, components, keep_last=1)
 
     def _find(self, env_steps: int) -> None:
-        """Take up what is kept, unless it is of later flights."""
+        """Read the score of an existing best checkpoint, or move that away if it has later env_steps."""
         with contextlib.suppress(FileNotFoundError, RunCheckpointError):  # the next evaluation replaces a damaged one
             kept = Checkpoint.manifest(newest_sound(self.directory))["metadata"]
             if kept["env_steps"] > env_steps:
@@ -265,7 +265,7 @@ class BestCheckpoint:
                 self.score = kept["score"]
 
     def _set_aside(self, kept: Mapping[str, Any]) -> None:
-        """Move away the best of evaluations after the one that the run goes on from."""
+        """Move away a best checkpoint from after the env_steps at which the run resumes."""
         aside = self.directory.with_name(self.directory.name + REPLACED)
         shutil.rmtree(aside, ignore_errors=True)
         self.directory.rename(aside)
@@ -276,10 +276,10 @@ class BestCheckpoint:
         )
 
     def offer(self, score: float, env_steps: int) -> bool:
-        """Save the parts if the score beats that of the kept ones; return whether it did."""
+        """Save the parts if the score is higher than that of the kept ones; return whether it was."""
         if self.score is not None and score <= self.score:
             return False
-        self._checkpoints.save(env_steps, {"score": score})  # which removes the one before it once this one is there
+        self._checkpoints.save(env_steps, {"score": score})  # afterwards removes the previous one
         self.score = score
         return True
 
@@ -290,13 +290,13 @@ def load_components(
     map_location: torch.device | str = "cpu",
     may_lack: Collection[str] = (),
 ) -> dict[str, Any]:
-    """Restores some parts of a checkpoint, for example ``{"learner": learner}`` for an evaluation.
+    """Restore some parts of a checkpoint, for example ``{"learner": learner}`` for an evaluation.
 
     Args:
-        path: run directory, folder of checkpoints, or one checkpoint.
-        components: the parts by the names they were saved under.
-        map_location: as in `RunCheckpoints.load`.
-        may_lack: as in `RunCheckpoints.load`.
+        path: Run directory, folder of checkpoints, or one checkpoint.
+        components: Parts by the names they were saved under.
+        map_location: As in `RunCheckpoints.load`.
+        may_lack: As in `RunCheckpoints.load`.
 
     Returns:
         The metadata of the checkpoint, with ``env_steps``.
@@ -311,29 +311,29 @@ def load_components(
 def _load_sound(
     source: Path, components: Mapping[str, Any], map_location: torch.device | str, may_lack: Collection[str]
 ) -> dict[str, Any]:
-    """Restores some parts of a checkpoint, or of what one process has there, whose files are known to be sound."""
+    """Restore some parts of a checkpoint, or of one process's folder in it, whose checksums were compared before."""
     lacking = set(may_lack) - Checkpoint.manifest(source)["components"].keys()
     there = {name: part for name, part in components.items() if name not in lacking}
     return _restore(_bind(there), source, map_location)
 
 
 def _path_of_sound(path: str | Path, parts: Collection[str]) -> str:
-    """Returns where the newest sound checkpoint is; nothing where another process looks."""
+    """Return the path of the newest undamaged checkpoint in rank 0, and an empty string in other processes."""
     return str(newest_sound(path, parts)) if parallel.is_first() else ""
 
 
 def newest_sound(path: str | Path, parts: Collection[str] | None = None) -> Path:
-    """Finds the newest complete checkpoint whose files are as they were saved; logs which it passes over, and why.
+    """Return the newest complete checkpoint with correct checksums; log which ones are skipped, and why.
 
     Args:
-        path: run directory, folder of checkpoints, or one checkpoint.
-        parts: which to look at; None for all.
+        path: Run directory, folder of checkpoints, or one checkpoint.
+        parts: Names of the parts to check; None for all.
 
     Raises:
         FileNotFoundError: if there is no complete checkpoint.
         RunCheckpointError: if all are damaged.
     """
-    damaged: dict[str, str] = {}  # what is wrong with which
+    damaged: dict[str, str] = {}  # description of the damage by checkpoint
     for candidate in complete_checkpoints(path):
         damage = damage_of(candidate, parts)
         if damage is None:
@@ -350,12 +350,12 @@ def newest_sound(path: str | Path, parts: Collection[str] | None = None) -> Path
 def load_state(
     path: str | Path, part: str, map_location: torch.device | str = "cpu"
 ) -> tuple[dict[str, Any], dict[str, Any]]:
-    """Reads the state of one part of a checkpoint without the part itself.
+    """Return the saved state of one part of a checkpoint, without an object to restore.
 
     Args:
-        path: run directory, folder of checkpoints, or one checkpoint.
-        part: the name that it was saved under.
-        map_location: as in `RunCheckpoints.load`.
+        path: Run directory, folder of checkpoints, or one checkpoint.
+        part: Name that it was saved under.
+        map_location: As in `RunCheckpoints.load`.
 
     Returns:
         The state, and the metadata of the checkpoint, with ``env_steps``.
@@ -370,7 +370,7 @@ def load_state(
 
 
 class _PlainState:
-    """Takes whatever a checkpoint holds of a part."""
+    """Stand-in for a part that keeps its saved state as it is."""
 
     def __init__(self) -> None:
         self.value: Mapping[str, Any] = {}
@@ -386,8 +386,8 @@ def _bind(components: Mapping[str, Any]) -> Checkpoint:
     checkpoint = Checkpoint()
     for name, component in components.items():
         has_state = hasattr(component, "state_dict") and not hasattr(component, "dump")
-        # One ordinary file a part: TorchRL's default is a memory map per tensor, thousands of files for an optimiser,
-        # and a write to a memory map on a full disk ends the process with a bus error.
+        # One ordinary file per part: TorchRL's default is a memory map per tensor, thousands of files for an optimiser,
+        # and a write to a memory map on a full disk kills the process with a bus error.
         adapter = StateDictCheckpointAdapter(payload_format="torch") if has_state else None
         checkpoint.register(name, component, adapter=adapter)
     return checkpoint
@@ -397,6 +397,6 @@ def _restore(checkpoint: Checkpoint, source: Path, map_location: torch.device | 
     try:
         return checkpoint.load(source, map_location=str(map_location)).manifest["metadata"]
     except CheckpointError as error:
-        # torch advises to read what is no state without its safeguard
+        # torch's own message advises to load the file without its safeguard
         reason = "A file of it holds what is no state." if "weights_only" in str(error) else error
         raise RunCheckpointError(f"The checkpoint {source} could not be restored. {reason}") from error

@@ -1,4 +1,4 @@
-"""The clocks of a run: where its time goes, how long it still takes, and when it logs, evaluates and saves."""
+"""Clocks of a run: time by activity, time left, and when to log, evaluate and save."""
 
 from __future__ import annotations
 
@@ -16,21 +16,21 @@ from dreamer_racing.training.metrics import PendingMetrics
 
 WALL_CLOCK, CPU_CLOCK = "wall_clock", "cpu_clock"
 SETTLING, MEASURED, REMEMBERED = 5.0, 30.0, 600.0
-"""Seconds of learning that are left out, that are measured before there is an answer, and that count [choice].
+"""Seconds of learning that `TimeLeft` skips, needs for an estimate, and remembers before it halves them [choice].
 
-The first updates are slower than all others; after a while a machine may be busier or less so.
+The first updates are slower than all others; later the load of the machine may change.
 """
 
 
 class RunClock:
-    """Shares of wall-clock time by activity, and rates of counters, since the last reading; and what the run has taken.
+    """Measures shares of wall-clock time by activity and rates of counters since the last reading, and total times.
 
-    CPU time is that of all threads of this process and of children that have ended, so that runs which shared their
-    cores with other work can be compared by it.
+    CPU time is that of all threads of this process and of its finished child processes, so that runs can be compared
+    even if they shared their cores with other work.
 
     Args:
-        counters: growing numbers, read and never written here.
-        alone: whether this process is all of the run; else its CPU time is not the run's, and is not read.
+        counters: Growing counters, which are only read here.
+        alone: Whether this process is the whole run; otherwise its CPU time is not that of the run, and is not read.
 
     Example:
         >>> counters = {"updates": 0}
@@ -48,10 +48,9 @@ class RunClock:
 
     @property
     def total(self) -> dict[str, float]:
-        """`wall_clock` and `cpu_clock`, s, since the run began, as far as known; settable, to go on with a run's.
+        """`wall_clock` and `cpu_clock` since the run began, s, as far as known; set them to resume a run.
 
-        Of a run that was continued from before there was a clock, that clock stays unknown. Once set, the next reading
-        is of what comes from now on, not of what was counted before.
+        A clock that is missing in the set value stays unknown. Setting also starts a new interval of `read`.
         """
         return {name: now - self._born[name] for name, now in _now().items() if name in self._born}
 
@@ -69,7 +68,7 @@ class RunClock:
 
     @contextmanager
     def timed(self, activity: str) -> Iterator[None]:
-        """Count the time spent inside as that activity's."""
+        """Add the time spent inside the context to that activity."""
         start = time.perf_counter()
         try:
             yield
@@ -77,7 +76,7 @@ class RunClock:
             self._seconds[activity] += time.perf_counter() - start
 
     def read(self) -> dict[str, float]:
-        """Shares `time/<activity>`, rates `rate/<counter>` in 1/s, and `total`; starts the next interval."""
+        """Return shares `time/<activity>`, rates `rate/<counter>` in 1/s, and `total`; start the next interval."""
         elapsed = time.perf_counter() - self._since
         readings = {f"time/{activity}": seconds / elapsed for activity, seconds in self._seconds.items()}
         for name, value in self._counters.items():
@@ -91,16 +90,16 @@ def _now() -> dict[str, float]:
 
 
 class TimeLeft:
-    """Tells how long a run still takes, from half a minute in which it learned.
+    """Estimates the remaining time of a run from at least half a minute of learning.
 
-    Filling a replay is no learning, and an evaluation in that half minute would count for too much: both are left out.
-    Once there is an answer, evaluations count, as they do in the rest of the run.
+    The prefill of the replay is not counted, nor are evaluations during that half minute, because they would weigh too
+    much. Once there is an estimate, evaluations count as they do in the rest of the run.
 
     Args:
-        total: env_steps at the end.
-        env_steps: those at the beginning.
-        updates: those at the beginning.
-        clock: in seconds.
+        total: env_steps at the end of the run.
+        env_steps: env_steps at its start.
+        updates: Updates at its start.
+        clock: Function that returns the time in seconds.
 
     Example:
         >>> left = TimeLeft(1000, clock=iter([0.0, 1.0, 10.0, 20.0, 60.0]).__next__)
@@ -124,11 +123,11 @@ class TimeLeft:
 
     @property
     def measured(self) -> bool:
-        """Whether there is an answer."""
+        """Whether there is an estimate."""
         return self._seconds >= MEASURED
 
     def advance(self, env_steps: int, updates: int) -> None:
-        """Take note of how far the run is, and how many updates it has made."""
+        """Report the env_steps and updates so far."""
         now = self._clock()
         seconds, steps = now - self._since, env_steps - self._env_steps
         if self._learns and (self.measured or not self._disturbed):
@@ -143,11 +142,11 @@ class TimeLeft:
         self._env_steps, self._since, self._disturbed = env_steps, now, False
 
     def disturb(self) -> None:
-        """Take note of an evaluation."""
+        """Report an evaluation."""
         self._disturbed = True
 
     def __str__(self) -> str:
-        """Hours, minutes and seconds, or that they are being measured."""
+        """Return hours, minutes and seconds to go, or that they are being measured."""
         if not self.measured or not self._steps:
             return "measuring how long it takes"
         remaining = max(0, self._total - self._env_steps)  # the last rollout may go past the end
@@ -158,11 +157,11 @@ class TimeLeft:
 class EvaluationConfig:
     """Evaluation during training."""
 
-    every: int = setting(25_000, NOT_NEGATIVE)  # env_steps; 0 never
-    first: int = setting(0, NOT_NEGATIVE)  # env_steps at which there is one before that, to look at; 0 none
+    every: int = setting(25_000, NOT_NEGATIVE)  # env_steps between evaluations; 0 turns them off
+    first: int = setting(0, NOT_NEGATIVE)  # env_steps of an additional early evaluation; 0 for none
     episodes: int = setting(8, COUNT)
-    stochastic: bool = False  # also fly the sampling policy
-    # of starts, as a multiple of the noise of training; 0: all begin at the start pose
+    stochastic: bool = False  # also evaluate the stochastic policy
+    # randomisation of starts, as a multiple of that in training; 0: all episodes begin at the start pose
     start_noise: float = setting(0.0, NOT_NEGATIVE)
     video_steps: int = setting(500, COUNT)  # control steps in the video
 
@@ -171,21 +170,21 @@ class EvaluationConfig:
 class CheckpointConfig:
     """Checkpoints during training."""
 
-    every: int = setting(50_000, NOT_NEGATIVE)  # env_steps
-    # of wall clock between two, for machines that are taken away; 0: by env_steps alone
+    every: int = setting(50_000, NOT_NEGATIVE)  # env_steps between checkpoints
+    # minutes of wall-clock time between checkpoints, for preemptible machines; 0: by env_steps alone
     minutes: float = setting(0.0, NOT_NEGATIVE)
-    keep: int = setting(2, COUNT)
+    keep: int = setting(2, COUNT)  # number of newest checkpoints kept
 
 
 class Periods:
-    """Says when something that happens every so many env_steps is due.
+    """Tells when periodic actions are due, by env_steps.
 
     Args:
-        first: env_steps at which a kind is due once more, before or between its periods, by its name.
-        every: env_steps between two of a kind, by its name; 0: never.
+        first: env_steps at which an action is due once in addition to its periods, by its name.
+        every: env_steps between two actions, by name; 0 for never.
 
     Attributes:
-        latest: env_steps at the latest of each kind; saved with the run.
+        latest: env_steps at which each action was last due; saved with the run.
 
     Example:
         >>> periods = Periods(log=100)
@@ -198,12 +197,12 @@ class Periods:
         self.latest = dict.fromkeys(every, 0)
 
     def due(self, name: str, env_steps: int, last: bool = False) -> bool:
-        """Whether another period has passed, or anything has since the latest; asking takes note of it.
+        """Return whether an action is due; if so, count it as done.
 
         Args:
-            name: what may be due.
-            env_steps: made by now.
-            last: whether the run ends here, so that no period comes to its end.
+            name: Name of the action.
+            env_steps: env_steps so far.
+            last: Whether the run ends here; then an unfinished period is enough.
         """
         period, latest, first = self._every[name], self.latest[name], self._first.get(name, 0)
         early = latest < first <= env_steps
@@ -214,11 +213,11 @@ class Periods:
 
 
 class Interval:
-    """Says when something that happens every so many minutes of wall clock is due; never if they are 0.
+    """Tells when a periodic action is due by wall-clock time; never if both arguments are 0.
 
     Args:
-        minutes: between two times.
-        first: minutes until the first time, if that is sooner; 0: as between two.
+        minutes: Minutes between two actions.
+        first: Minutes until the first action, if that is sooner; 0 for ``minutes``.
     """
 
     def __init__(self, minutes: float, first: float = 0.0) -> None:
@@ -227,7 +226,7 @@ class Interval:
         self._last = time.monotonic()
 
     def due(self) -> bool:
-        """Whether the interval has passed; if so it begins anew."""
+        """Return whether the interval has passed; if so, start the next one."""
         if not self._next or time.monotonic() - self._last < self._next:
             return False
         self._last, self._next = time.monotonic(), self._seconds
@@ -235,11 +234,11 @@ class Interval:
 
 
 class Journal:
-    """Periods and the metrics under way, as one part of a checkpoint: with it a resumed run writes the same rows.
+    """State of periods and pending metrics as one part of a checkpoint, so that a resumed run writes the same rows.
 
     Args:
-        periods: of the run.
-        pending: metrics that are in no row yet.
+        periods: Periods of the run.
+        pending: Metrics that are not yet written.
     """
 
     def __init__(self, periods: Periods, pending: PendingMetrics) -> None:

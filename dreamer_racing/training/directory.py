@@ -1,4 +1,4 @@
-"""A run directory: one process at a time in it, what lies where, and what of it is complete."""
+"""Run directory: its layout, its lock, and the search for complete checkpoints."""
 
 from __future__ import annotations
 
@@ -26,21 +26,21 @@ logger = logging.getLogger(__name__)
 CHECKPOINTS = "checkpoints"
 PREFIX = "checkpoint"
 REPLACED = ".replaced"
-"""End of the hidden name under which a checkpoint waits until another of its name is there."""
+"""Suffix of files and folders that were moved aside, such as a checkpoint that is being replaced."""
 PROCESS, PROCESSES = "process-", "processes"
-"""Folders of what processes beside the first have of their own, and the metadata that says how many there were."""
+"""Prefix of the folders of ranks above 0, and the metadata key of the number of processes."""
 EVALUATION = "evaluation.json"
-"""Numbers of an evaluation, in whichever folder it is written to."""
+"""File name of an evaluation's numbers."""
 BEGUN = ".begun"
-"""File by which a process claims a folder for what it is about to measure."""
+"""File by which a process claims a folder for its results."""
 
 
 @dataclass(frozen=True)
 class RunDirectory:
-    """The folder of a run, or of its best checkpoint, which is laid out alike.
+    """Layout of the folder of a run, or of its best checkpoint, which is the same.
 
     Args:
-        path: the folder.
+        path: The folder.
 
     Example:
         >>> RunDirectory(Path("runs/example")).metrics
@@ -51,64 +51,64 @@ class RunDirectory:
 
     @classmethod
     def of(cls, checkpoint: Path) -> RunDirectory:
-        """Return that of the run which left a checkpoint."""
+        """Return the directory of the run that a checkpoint belongs to."""
         return cls(checkpoint.parents[1])
 
     @property
     def checkpoints(self) -> Path:
-        """Folder of checkpoints, everything that a run goes on from."""
+        """Folder of checkpoints, from which the run can be resumed."""
         return self.path / CHECKPOINTS
 
     @property
     def best(self) -> RunDirectory:
-        """Networks as they were at the best evaluation, with the configuration."""
+        """Directory of the best checkpoint: networks at the best evaluation, with the configuration."""
         return RunDirectory(self.path / "best")
 
     @property
     def run(self) -> RunDirectory:
-        """That of the run, where this is its best checkpoint's; else this one."""
+        """Directory of the run, if this one is that of its best checkpoint; else this one."""
         around = RunDirectory(self.path.parent)
         is_run = around.config.exists() or around.starts.exists()
         return around if self == around.best and is_run else self
 
     @property
     def config(self) -> Path:
-        """The resolved configuration of the latest start."""
+        """File of the resolved configuration of the latest start."""
         return self.path / "config.yaml"
 
     @property
     def overrides(self) -> Path:
-        """What it was composed from, a YAML list."""
+        """File of the overrides that the configuration was composed from, a YAML list."""
         return self.path / "overrides.yaml"
 
     @property
     def starts(self) -> Path:
-        """Every start of the run, a line of JSON each: see ``note_start``."""
+        """File with a line of JSON for every start of the run; see ``note_start``."""
         return self.path / "starts.jsonl"
 
     @property
     def metrics(self) -> Path:
-        """Table over env_steps."""
+        """Table of metrics over env_steps."""
         return self.path / "metrics.csv"
 
     @property
     def wandb_run(self) -> Path:
-        """The id that the run has at W&B."""
+        """File with the run's ID at W&B."""
         return self.path / "wandb" / "run.json"
 
     @property
     def evaluations(self) -> Path:
-        """Folder of what evaluations during training measured."""
+        """Folder of the results of evaluations during training."""
         return self.path / "evaluations"
 
     @property
     def plots(self) -> Path:
-        """Folder of pictures."""
+        """Folder of plots."""
         return self.path / "plots"
 
     @property
     def videos(self) -> Path:
-        """Folder of films."""
+        """Folder of videos."""
         return self.path / "videos"
 
     @property
@@ -118,40 +118,40 @@ class RunDirectory:
 
     @property
     def evaluation_file(self) -> Path:
-        """Numbers of that evaluation."""
+        """File with the numbers of that evaluation."""
         return self.evaluation / EVALUATION
 
     @property
     def replay(self) -> Path:
-        """Folder of this process's replay while the run goes on, with ``replay.storage=memmap``."""
+        """Folder of this process's replay buffer during the run, with ``replay.storage=memmap``."""
         return self.path / "replay" / f"{PROCESS}{parallel.rank()}"
 
     @property
     def nonfinite_batch(self) -> Path:
-        """The batch whose loss was not finite."""
+        """File of the batch whose loss was not finite."""
         return self.path / "nonfinite_batch.pt"
 
     @property
     def finished(self) -> Path:
-        """What says that all that the run was asked for is done, evaluation and metrics included."""
+        """File that marks the run as finished, including its last evaluation and metrics."""
         return self.path / "finished.json"
 
     def claim(self) -> RunLock:
-        """Make the folder if needed, and hold it for this process alone.
+        """Create the folder if needed, and lock it for this process.
 
         Raises:
-            PermissionError: nothing can be written there.
-            ValueError: a live run holds it.
+            PermissionError: The folder is not writable.
+            ValueError: A live run holds its lock.
         """
         made = not self.path.exists()
         return RunLock(ensure_writable(self.path), made)
 
     def mark_finished(self, env_steps: int) -> None:
-        """Note that all is done."""
+        """Mark the run as finished."""
         replace_text(self.finished, json.dumps({"env_steps": env_steps}) + "\n")
 
     def finished_env_steps(self) -> int:
-        """Return the env_steps that the run was finished at; 0 if it was not, or if nobody can tell."""
+        """Return the env_steps at which the run finished; 0 if it has not, or if the mark is damaged."""
         try:
             return int(json.loads(self.finished.read_text(encoding="utf-8"))["env_steps"])
         except FileNotFoundError:
@@ -161,14 +161,14 @@ class RunDirectory:
             return 0
 
     def latest_evaluation(self) -> str | None:
-        """Return what files of the deterministic policy's latest evaluation are called, its env_steps; None without."""
+        """Return the file stem of the deterministic policy's latest evaluation, its env_steps; None without any."""
         names = (path.stem for path in self.evaluations.glob("*.json"))
         return max((name for name in names if name.isdecimal()), key=int, default=None)
 
     def set_aside_after(self, env_steps: int) -> None:
-        """Move what evaluations left after where the run goes on to ``evaluations.replaced``, and so on.
+        """Move files of evaluations after ``env_steps`` to ``evaluations.replaced``, ``plots.replaced`` and so on.
 
-        They are of flights that are to be flown again, perhaps otherwise.
+        They belong to a part of the run that is now repeated, perhaps with other results.
         """
         moved: set[int] = set()
         for folder in (self.evaluations, self.plots, self.videos):
@@ -188,13 +188,13 @@ class RunDirectory:
             )
 
     def note_start(self, env_steps: int, overrides: Sequence[str], commit: str | None) -> None:
-        """Note that the run was begun, or continued at so many env_steps, with which overrides at which commit."""
+        """Append a start or resume of the run at ``env_steps``, with its overrides and commit, to `starts`."""
         line = {"env_steps": env_steps, "overrides": list(overrides), "commit": commit}
         with self.starts.open("a", encoding="utf-8") as file:
             file.write(json.dumps({"date": f"{datetime.now(UTC):%Y-%m-%d %H:%M}", **line}) + "\n")
 
     def read_starts(self) -> list[dict[str, Any]]:
-        """Return every start that was noted; none of runs of older versions."""
+        """Return all recorded starts; runs of older versions have none."""
         try:
             lines = self.starts.read_text(encoding="utf-8").splitlines(keepends=True)
         except FileNotFoundError:
@@ -204,21 +204,21 @@ class RunDirectory:
             try:
                 starts.append(json.loads(line))
             except ValueError:
-                if line.endswith("\n"):  # a kill may cut the last one short
+                if line.endswith("\n"):  # a kill may truncate the last line
                     logger.warning("A line of %s is damaged, and left out.", self.starts)
         return starts
 
 
 def complete_checkpoints(path: str | Path) -> list[Path]:
-    """Finds the complete checkpoints, newest first. Folders that a killed process left incomplete are passed over.
+    """Return the complete checkpoints, newest first; incomplete folders of a killed process are skipped.
 
-    One that had stepped aside for another of its name, which never came, is among them.
+    A checkpoint that was renamed for a replacement that was never completed is included.
 
     Args:
-        path: run directory, folder of checkpoints, or one checkpoint.
+        path: Run directory, folder of checkpoints, or one checkpoint.
 
     Raises:
-        FileNotFoundError: if there is none.
+        FileNotFoundError: If there is none.
     """
     path = Path(path).absolute()
     if is_complete(path):
@@ -248,23 +248,23 @@ def complete_checkpoints(path: str | Path) -> list[Path]:
 
 
 def stepped_aside(path: Path) -> Path:
-    """Return the name that a checkpoint had before it stepped aside."""
+    """Return the path that a checkpoint had before it was renamed for its replacement."""
     return path.with_name(path.name.removeprefix(".").removesuffix(REPLACED))
 
 
 def env_steps_of(checkpoint: Path) -> int:
-    """Return the env_steps that a checkpoint's name tells; -1 of a name that tells none."""
+    """Return the env_steps in a checkpoint's name; -1 if there are none."""
     number = stepped_aside(checkpoint).name.rpartition("-")[2]
     return int(number) if number.isdecimal() else -1
 
 
 def latest_checkpoint(path: str | Path) -> Path:
-    """Finds the newest complete checkpoint, as ``complete_checkpoints`` does."""
+    """Return the newest complete checkpoint; see ``complete_checkpoints``."""
     return complete_checkpoints(path)[0]
 
 
 def replace_text(path: Path, text: str) -> None:
-    """Write a file so that, whatever happens meanwhile, it is as it was or as it is to be."""
+    """Replace a file's text atomically."""
     partial = path.with_name(f".{path.name}.partial")
     with partial.open("w", encoding="utf-8") as file:
         file.write(text)
@@ -274,17 +274,17 @@ def replace_text(path: Path, text: str) -> None:
 
 
 def ensure_writable(directory: str | Path, setting_name: str = "run_dir") -> Path:
-    """Creates a folder if needed and writes a file to it, to fail before a run and not at its first checkpoint.
+    """Create a folder if needed, and test that it is writable, to fail before a run and not at its first checkpoint.
 
     Args:
-        directory: the folder.
-        setting_name: by which a person chooses another.
+        directory: The folder.
+        setting_name: Name of the setting that chooses the folder, for the message.
 
     Returns:
         The absolute path of the folder.
 
     Raises:
-        PermissionError: if nothing can be written there.
+        PermissionError: If the folder is not writable.
     """
     directory = Path(directory).expanduser().absolute()
     try:
@@ -302,24 +302,24 @@ def ensure_writable(directory: str | Path, setting_name: str = "run_dir") -> Pat
 
 
 def is_complete(path: Path) -> bool:
-    """Whether the manifest, which is written last, is there with every file it lists (a copy may have lost some)."""
+    """Return whether the manifest, which is written last, exists with every file it lists (a copy may lack some)."""
     if not path.is_dir():
         return False
     try:
         parts = Checkpoint.manifest(path)["components"].values()
-    except (CheckpointError, OSError, TypeError, ValueError, AttributeError):  # the last for JSON that is no object
+    except (CheckpointError, OSError, TypeError, ValueError, AttributeError):  # the last if JSON is no object
         return False
     return all((path / part["path"] / name).is_file() for part in parts for name in part["files"])
 
 
 def fresh_directory(path: str | Path, result: str) -> Path:
-    """Return a folder to write to: the one asked for, or if it holds anything already, the first free `<name>_2`, ...
+    """Return an empty folder to write to: the given one, or if it is not empty, the first free `<name>_2`, ...
 
-    So nothing is mixed with what an earlier evaluation left, or one that was killed, or another that goes on.
+    So results are not mixed with those of an earlier, killed or concurrent evaluation.
 
     Args:
-        path: the folder asked for.
-        result: name of the file that is written last.
+        path: Requested folder.
+        result: Name of the file that is written last.
     """
     asked = Path(path).expanduser().absolute()
     for number in count(1):
@@ -336,20 +336,20 @@ def fresh_directory(path: str | Path, result: str) -> Path:
 
 
 class RunLock:
-    """Holds a run directory until `release`, or until the process ends in whatever way.
+    """Lock of a run directory, held until `release` or the end of the process.
 
-    Across machines it holds where the file system's locks do (NFS 4, Lustre with flock); where there are no locks it
-    warns, and holds nothing.
+    It works across machines if the file system's locks do (NFS 4, Lustre with flock); without any locks it only logs a
+    warning.
 
     Args:
-        directory: of the run, which exists.
-        made: whether it was made for this lock.
+        directory: Existing run directory.
+        made: Whether the directory was created for this lock.
 
     Attributes:
-        directory: as given.
+        directory: As given.
 
     Raises:
-        ValueError: a live process holds it; the message names that one.
+        ValueError: A live process holds the lock; the message names it.
 
     Example:
         >>> lock = RunLock("runs/example")  # doctest: +SKIP
@@ -376,13 +376,13 @@ class RunLock:
         self._file.flush()
 
     def release(self) -> None:
-        """Let the next one in."""
+        """Release the lock."""
         self._file.close()
 
     def abandon(self) -> None:
-        """Let the next one in; a folder that was made for this lock, and holds nothing else, goes."""
+        """Release the lock, and remove the folder if it was created for this lock and holds nothing else."""
         path = Path(self._file.name)
-        with suppress(OSError):  # it stays, then
+        with suppress(OSError):  # the folder stays then
             if self._made and list(self.directory.iterdir()) == [path]:
                 path.unlink()
                 self.directory.rmdir()

@@ -1,6 +1,6 @@
-"""The episodes in a collector's rollouts, and how well they fly, as a clock for what is scheduled.
+"""Finished episodes in a collector's rollouts, and their gate pass rate, which schedules depend on.
 
-Shapes: N environments, T steps a rollout, E finished episodes.
+Shapes: N environments, T steps per rollout, E finished episodes, G gates.
 """
 
 from __future__ import annotations
@@ -14,23 +14,23 @@ from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 
 MEMORY = 200
-"""Attempts at a gate over which its share is a running mean [choice]: it is then known to about 0.03."""
+"""Attempts at a gate over which its pass rate is a running mean [choice]; its standard error is then about 0.03."""
 KNOWN = 0.4
-"""Share from which on a way through the hardest gate is known [choice]."""
+"""Pass rate of the gate with the lowest one above which the whole lap counts as known [choice]."""
 PACE = 3.0
-"""What `GatePassRate.known` gains over a whole run at least, once that gate is known [choice]: 0.4 in 200,000 of
+"""Minimum increase of `GatePassRate.known` per length of the run, once the lap is known [choice]: 0.4 in 200,000 of
 1,500,000 env_steps."""
 
 
 class EpisodeTracker:
-    """Finds the finished episodes in a collector's rollouts, carrying unfinished ones from rollout to rollout.
+    """Finds the finished episodes in a collector's rollouts, and carries unfinished ones from rollout to rollout.
 
     Its returns are exact; TorchRL's ``RewardSum`` and ``StepCounter`` sum in float32, in every step of the environment,
     and are off by some 1e-6.
 
     Args:
         num_envs: N.
-        crash_causes: names of the values of ``("next", "race", "crash")``, 0 meaning no crash.
+        crash_causes: Names of the values of ``("next", "race", "crash")``; 0 means no crash.
 
     Example:
         >>> tracker = EpisodeTracker(num_envs=16)
@@ -47,22 +47,22 @@ class EpisodeTracker:
         self._length = torch.zeros(num_envs, dtype=torch.int64)  # (N,)
 
     def update(self, rollout: TensorDictBase) -> TensorDictBase:
-        """Accounts for one rollout.
+        """Add one rollout, and return the episodes that ended in it.
 
         Args:
-            rollout: batch ``[N, T]`` with ``("next", "reward")``, ``("next", "done")`` and, if there are any,
+            rollout: Batch ``[N, T]`` with ``("next", "reward")``, ``("next", "done")`` and optionally
                 ``("next", "truncated")``, ``("next", "race", ...)`` and the root's ``is_init``.
 
         Returns:
             Finished episodes, batch ``[E]``, on the CPU, in the order in which they ended: ``env`` int64, ``return``
-            float32 (undiscounted), ``length`` int64 (control steps), and as they were at the episode's last step
-            ``truncated``, ``gates_passed``, ``crash``, ``finished`` and ``target_gate``, as far as the rollout
-            has them, all ``(E,)``.
+            float32 (undiscounted), ``length`` int64 (control steps), and the values at the episode's last step of
+            ``truncated``, ``gates_passed``, ``crash``, ``finished`` and ``target_gate``, if the rollout has them; all
+            ``(E,)``.
         """
         reward = rollout["next", "reward"].squeeze(-1).cpu().double()  # (N, T)
         done = rollout["next", "done"].squeeze(-1).cpu()
         self._forget_interrupted(rollout)
-        # Sums since the unfinished episode began, or since the rollout's first step after that.
+        # Sums over the rollout, plus those that the unfinished episode brings from earlier rollouts.
         returned = self._return.unsqueeze(-1) + reward.cumsum(-1)  # (N, T)
         lasted = self._length.unsqueeze(-1) + torch.arange(1, done.shape[-1] + 1)
         env, step = done.nonzero(as_tuple=True)  # (E,) environment by environment
@@ -78,10 +78,10 @@ class EpisodeTracker:
         return TensorDict(episodes, batch_size=[len(env)])[order]
 
     def summary(self, episodes: TensorDictBase) -> dict[str, float]:
-        """Returns the metrics of finished episodes: means, and for each crash cause the share that ended by it.
+        """Return metrics of finished episodes: means, and the share of episodes that ended by each crash cause.
 
         Args:
-            episodes: batch ``[E]`` of `update`.
+            episodes: Batch ``[E]`` of `update`.
 
         Returns:
             ``episode/return``, ``episode/length``, ``episode/gates_passed``, ``crash/<cause>``; empty if E = 0.
@@ -105,7 +105,7 @@ class EpisodeTracker:
         self._length = state_dict["length"].clone()
 
     def _forget_interrupted(self, rollout: TensorDictBase) -> None:
-        """Drops the unfinished episodes of environments that were reset meanwhile, as they are when a run resumes."""
+        """Drop unfinished episodes of environments that were reset between rollouts, for example at a resume."""
         is_init = rollout.get("is_init", None)
         if is_init is not None:
             began = is_init[:, 0].reshape(-1).cpu()
@@ -113,7 +113,7 @@ class EpisodeTracker:
             self._length[began] = 0
 
     def _carry(self, returned: Tensor, lasted: Tensor, env: Tensor, step: Tensor) -> None:
-        """Keeps what came after each environment's last episode end."""
+        """Keep the sums since each environment's last episode end."""
         last = torch.full((len(returned),), -1).scatter_reduce(0, env, step, "amax")  # (N,) −1: none ended
         at = last.clamp(min=0).unsqueeze(-1)
         self._return, self._length = (
@@ -128,18 +128,18 @@ class EpisodeTracker:
 
 
 class GatePassRate:
-    """The share of flights that pass the hardest gate of a track, of those that come from the gate before it.
+    """Pass rate of each gate of a track, among attempts that come from the gate before, and the lowest of these rates.
 
-    It is the hardest gate that tells when a whole lap is known: a mean over gates is high where most are passed and one
-    never is. What an episode does with its first gate is not counted, since training may begin one right before it.
-    An episode that runs out of time has failed at no gate.
+    The lowest rate tells whether a whole lap is known; a mean would be high even if one gate was never passed. An
+    episode's first gate does not count, because training may start right before it. An episode that runs out of time
+    has failed at no gate.
 
     Args:
-        num_gates: Of the track, G; 0: there is no race, and the share stays 0.
+        num_gates: G, number of gates of the track; 0 without a race, when the rate stays 0.
 
     Attributes:
-        best: The highest that the share has been since each gate's decayed count of attempts was half of `MEMORY`, 0
-            before: it never goes back, so that what is scheduled by it does not swing with it.
+        best: Highest value of the lowest rate since the decayed number of attempts of each gate reached half of
+            `MEMORY`; 0 before. It never falls, so schedules that depend on it do not oscillate.
         known_since: env_steps at which `best` reached `KNOWN`; None before.
 
     Example:
@@ -157,23 +157,23 @@ class GatePassRate:
     def __init__(self, num_gates: int) -> None:
         self.best = 0.0
         self.known_since: int | None = None
-        self._passes = torch.zeros(num_gates, dtype=torch.float64)  # (G,), forgotten at the rate of one in MEMORY
+        self._passes = torch.zeros(num_gates, dtype=torch.float64)  # (G,), decayed by 1 / MEMORY per attempt
         self._attempts = torch.zeros(num_gates, dtype=torch.float64)  # (G,)
 
     def update(self, episodes: TensorDictBase, env_steps: int) -> float:
-        """Take note of finished episodes; return the share.
+        """Update the rates by finished episodes; return the lowest rate.
 
         Args:
             episodes: Batch ``[E]`` of ``EpisodeTracker.update``.
-            env_steps: Made so far.
+            env_steps: env_steps so far.
         """
         num_gates = len(self._passes)
         if not num_gates or not len(episodes):
             return self.share
         passed, target = episodes["gates_passed"].unsqueeze(-1), episodes["target_gate"].unsqueeze(-1)  # (E, 1)
         gates = torch.arange(num_gates)
-        # How many passes ago gate g was passed last, 1 being the pass before the target; then every G passes before it.
-        # The first pass of an episode, `passed` ago, is left out.
+        # Number of passes since gate g was passed last, 1 for the gate before the target; earlier passes are G apart.
+        # The first pass of an episode, `passed` ago, is not counted.
         ago = (target - gates - 1) % num_gates + 1  # (E, G)
         passes = ((passed - 1 - ago) // num_gates + 1).clamp(min=0).sum(0)  # (G,)
         failed = (episodes["crash"].unsqueeze(-1) != 0) & (passed > 0) & (target == gates)
@@ -188,14 +188,14 @@ class GatePassRate:
         return self.share
 
     def known(self, env_steps: int, total_env_steps: int) -> float:
-        """`best`, or what time has made of `KNOWN` since it was reached, whichever is more.
+        """Return the larger of `best` and a value that rises linearly with env_steps from `KNOWN` once it is reached.
 
-        What a setting holds back must not hold back that setting: where gates are missed for a large deviation alone,
-        their share stays as it is until the deviation falls.
+        This prevents a deadlock: if gates are only missed because of a large standard deviation of actions, their pass
+        rate does not rise until the schedule lowers that standard deviation.
 
         Args:
-            env_steps: Made so far.
-            total_env_steps: Of the whole run.
+            env_steps: env_steps so far.
+            total_env_steps: Length of the whole run.
         """
         if self.known_since is None:
             return self.best
@@ -203,17 +203,17 @@ class GatePassRate:
 
     @property
     def shares(self) -> torch.Tensor:
-        """Of each gate as it is now, (G,); 0 before the first attempt."""
+        """Current pass rate of each gate, (G,); 0 before the first attempt."""
         return self._passes / self._attempts.clamp(min=1.0)
 
     @property
     def share(self) -> float:
-        """Of the hardest gate as it is now."""
+        """Current pass rate of the gate with the lowest one."""
         return float(self.shares.min()) if len(self._passes) else 0.0
 
     @property
     def hardest_gate(self) -> int:
-        """Which gate that is, in the order of the track."""
+        """Index of the gate with the lowest pass rate, in the order of the track."""
         return int(self.shares.argmin())
 
     def state_dict(self) -> dict[str, Any]:

@@ -1,4 +1,4 @@
-"""What a process has in place of what the first one writes, where several train together (`parallel`)."""
+"""Substitutes, in processes of rank above 0, for objects that write files in rank 0 (`parallel`)."""
 
 from __future__ import annotations
 
@@ -11,10 +11,10 @@ from torchrl.record.loggers import Logger
 
 
 class LockHeldByFirst:
-    """A run directory that the first process holds.
+    """Substitute for the `RunLock`, which rank 0 holds.
 
     Args:
-        directory: of the run.
+        directory: Run directory.
     """
 
     def __init__(self, directory: Path) -> None:
@@ -28,7 +28,7 @@ class LockHeldByFirst:
 
 
 class UnwrittenMetrics:
-    """Takes metrics, and keeps none."""
+    """Substitute for the `MetricsLog` that drops all metrics."""
 
     def __init__(self) -> None:
         self.loggers: list[Logger] = []
@@ -48,13 +48,13 @@ class UnwrittenMetrics:
 
 
 class NoReport:
-    """An evaluation that the first process makes."""
+    """Substitute for the evaluator, because only rank 0 evaluates."""
 
     on_episode: Callable[[int, int], None] | None = None
     attempt: Callable[[str], AbstractContextManager] = nullcontext
 
     def make(self, env_steps: int, stochastic: bool = False) -> dict[str, float]:
-        """Refuse: whoever asks has not looked which process this is."""
+        """Raise ``RuntimeError``: only rank 0 may call this."""
         raise RuntimeError("The first process alone evaluates.")
 
     def close(self) -> None:

@@ -1,7 +1,4 @@
-"""What loggers that can show more than scalars are given to show of a run.
-
-`figures.loggers` has those that there are.
-"""
+"""Protocol of loggers that also take configurations, pictures and videos; `figures.loggers` implements them."""
 
 from __future__ import annotations
 
@@ -16,28 +13,28 @@ from dreamer_racing.training.directory import RunDirectory
 
 @runtime_checkable
 class MediaLogger(Protocol):
-    """What a run asks of a logger beside scalars."""
+    """Methods of a logger that takes more than scalars."""
 
     def log_configuration(self, settings: Mapping[str, Any], text: str) -> None:
-        """Take a run's settings by dotted name, and the same as YAML."""
+        """Log a run's settings by dotted name, and the same as YAML text."""
         ...
 
     def log_picture(self, name: str, file: Path, env_steps: int) -> None:
-        """Take a PNG file."""
+        """Log a PNG file."""
         ...
 
     def log_film(self, name: str, file: Path, env_steps: int) -> None:
-        """Take an mp4 file."""
+        """Log an mp4 file."""
         ...
 
 
 def log_evaluation(loggers: Sequence[Logger], directory: RunDirectory, env_steps: int) -> None:
-    """Give loggers what evaluations at these env_steps have left to look at.
+    """Log the plots and videos of the evaluations at ``env_steps``.
 
     Args:
-        loggers: those among them that are no `MediaLogger` are left out.
-        directory: of the run.
-        env_steps: of the evaluation.
+        loggers: Loggers; those that are not a `MediaLogger` are skipped.
+        directory: Run directory.
+        env_steps: env_steps of the evaluation.
     """
     stem = f"{env_steps:09d}"
     for sink in loggers:

@@ -1,4 +1,4 @@
-"""Metrics of a run: a CSV file over ``env_steps``, and loggers beside it."""
+"""Metrics of a run: a CSV file over ``env_steps``, and further loggers."""
 
 from __future__ import annotations
 
@@ -23,22 +23,22 @@ from dreamer_racing.training.directory import RunDirectory
 logger = logging.getLogger(__name__)
 X_AXIS = "env_steps"
 MOST_DIGITS = 19
-"""Of env_steps: more are damage, and Python reads no more than some thousands."""
+"""Maximum number of digits of env_steps; a longer number is damaged, and Python's int() reads only some thousands."""
 
 
 class MetricsLog:
-    """Averages the metrics pushed since the last write and writes them to ``metrics.csv`` and to loggers.
+    """Averages the metrics pushed since the last write, and writes them to ``metrics.csv`` and to loggers.
 
-    The file has one row a write and a column ``env_steps`` first; a metric that appears later gets a new column at the
-    end, empty in earlier rows. Whatever the moment the process is killed, at most the row being written is lost. Rows
-    that a full disk refuses wait for the next write.
+    The file has one row per write, and ``env_steps`` as its first column; a metric that appears later gets a new column
+    at the end, empty in earlier rows. If the process is killed, at most the row being written is lost. Rows that cannot
+    be written to a full disk wait for the next write.
 
     Args:
-        run_dir: folder of the run.
-        loggers: TorchRL loggers that receive every row too (`dreamer_racing.figures.loggers` makes some).
-        resume_env_steps: of the latest row of the checkpoint this run continues: rows beyond it are removed. If None,
-            the run is new, and a ``metrics.csv`` already there is kept under another name.
-        pending: what is in no row yet, to be saved with the run; None for a new one.
+        run_dir: Folder of the run.
+        loggers: TorchRL loggers that also receive every row (`dreamer_racing.figures.loggers` makes some).
+        resume_env_steps: env_steps of the last row that a resumed run keeps: later rows are removed. If None, the run
+            is new, and an existing ``metrics.csv`` is kept under another name.
+        pending: Metrics that are not yet written, to be saved with the run; None for a new run.
 
     Example:
         >>> with MetricsLog("runs/example") as metrics:  # doctest: +SKIP
@@ -66,28 +66,28 @@ class MetricsLog:
             self._truncate(resume_env_steps)
 
     def push(self, metrics: Mapping[str, Tensor | float], count: int = 1) -> None:
-        """Adds values to the averages; tensors stay on their device, so that nothing waits for it.
+        """Add values to the averages; tensors stay on their device, so nothing waits for it.
 
         Args:
-            metrics: values by name; of a tensor of several elements the mean counts.
-            count: as how many values each counts, being the mean of so many.
+            metrics: Values by name; a tensor with several elements is averaged.
+            count: Weight of each value: the number of values that it is the mean of.
         """
         self._pending.averages.push(metrics, count)
 
     def write(self, env_steps: int) -> dict[str, float]:
-        """Makes a row of the averages and writes it: `close_row` and `flush`."""
+        """Make a row of the averages and write it: `close_row` and `flush`."""
         values = self.close_row(env_steps)
         self.flush()
         return values
 
     def close_row(self, env_steps: int) -> dict[str, float]:
-        """Makes a row of the averages, to be written by `flush`, and starts new ones. Waits for the device once.
+        """Make a row of the averages, which `flush` writes, and start new averages. Waits for the device once.
 
         Args:
-            env_steps: control steps summed over environments.
+            env_steps: Control steps summed over environments.
 
         Returns:
-            The averages by name; empty, and no row made, if nothing was pushed.
+            The averages by name; empty, without a new row, if nothing was pushed.
         """
         values = self._pending.averages.pop()
         if values:
@@ -95,11 +95,11 @@ class MetricsLog:
         return values
 
     def flush(self) -> None:
-        """Writes the rows that wait.
+        """Write the pending rows.
 
         Raises:
-            OSError: the file cannot be written; then it is as it was, and the rows go on waiting. Or a logger cannot
-                write, which neither they nor the other loggers wait for.
+            OSError: The file cannot be written; then it is unchanged, and the rows stay pending. Or a logger cannot
+                write; then the file and the other loggers still have the rows.
         """
         rows = self._pending.rows
         if not rows:
@@ -125,9 +125,9 @@ class MetricsLog:
             raise failed
 
     def close(self) -> None:
-        """Closes the loggers that can be closed."""
+        """Close the loggers that can be closed."""
         for sink in self.loggers:
-            for name in ("close", "finish"):  # TensorBoard's word for it, and W&B's
+            for name in ("close", "finish"):  # method of TensorBoard and of W&B
                 if end := getattr(sink.experiment, name, None):
                     try:
                         end()
@@ -152,7 +152,7 @@ class MetricsLog:
         self._rewrite([{name: row[name] for name in (X_AXIS, *columns)} for row in kept], columns)
 
     def _append(self, rows: Iterable[tuple[int, Mapping[str, float]]]) -> None:
-        """Adds rows of known columns; the file is as it was if it cannot be done."""
+        """Append rows with known columns; if that fails, restore the file."""
         size = self.path.stat().st_size
         try:
             with self.path.open("a", newline="", encoding="utf-8") as file:
@@ -166,7 +166,7 @@ class MetricsLog:
             raise
 
     def _rewrite(self, rows: Iterable[Mapping[str, str]], new_columns: Sequence[str]) -> None:
-        """Replaces the file by one with these rows and further columns."""
+        """Replace the file by one with these rows and additional columns."""
         columns = [*self._columns, *new_columns]
         partial = self.path.with_name(f".{self.path.name}.partial")
         with partial.open("w", newline="", encoding="utf-8") as file:
@@ -180,11 +180,11 @@ class MetricsLog:
 
 
 class PendingMetrics:
-    """What of a run's metrics is in no file yet, and how far the file goes.
+    """Metrics of a run that are not yet in the file, and the position of the file.
 
     Attributes:
-        averages: of what was pushed since the latest row.
-        rows: env_steps and values of rows that could not be written yet.
+        averages: Averages of the metrics pushed since the latest row.
+        rows: env_steps and values of rows that are not yet written.
         written: env_steps of the latest row in the file; 0 before the first.
     """
 
@@ -204,7 +204,7 @@ class PendingMetrics:
 
 
 def _read_rows(path: Path) -> list[dict[str, str]]:
-    """Read the complete rows; those without a number of env_steps are left out, and this is logged."""
+    """Read the complete rows; skip those without a number of env_steps, and log that."""
     header, cells, _ = read_rows(path)
     rows = [dict(zip(header, row, strict=True)) for row in cells]
     damaged = [row[X_AXIS] for row in rows if not _is_count(row[X_AXIS])]
@@ -217,7 +217,7 @@ def _read_rows(path: Path) -> list[dict[str, str]]:
 
 
 def _is_count(cell: str) -> bool:
-    """Whether a cell is a whole number as this file's are written."""
+    """Return whether a cell is a whole number in the format of this file."""
     return cell.isascii() and cell.isdigit() and len(cell) < MOST_DIGITS
 
 
@@ -232,9 +232,9 @@ def _keep_aside(path: Path) -> None:
 
 
 class RunningMean:
-    """Means of named values, summed where the values are.
+    """Running means of named values, summed on the values' device.
 
-    The tensors of one push are stacked and added to the sums of their names: two kernels a push however many names.
+    The tensors of one push are stacked and added to the sums of their names: two kernels for any number of names.
     """
 
     def __init__(self) -> None:
@@ -242,7 +242,7 @@ class RunningMean:
         self._floats: dict[str, tuple[float, int]] = {}
 
     def push(self, metrics: Mapping[str, Tensor | float], count: int = 1) -> None:
-        """Add values to the averages, each of which counts as so many; tensors stay on their device."""
+        """Add values to the averages with weight ``count``; tensors stay on their device."""
         by_device: dict[torch.device, dict[str, Tensor]] = defaultdict(dict)
         for name, value in metrics.items():
             if isinstance(value, Tensor):
@@ -264,14 +264,14 @@ class RunningMean:
         }
 
     def load_state_dict(self, state_dict: Mapping[str, Any]) -> None:
-        """Restore what `state_dict` returned, on the device that it was loaded to."""
+        """Restore what `state_dict` returned; tensors stay on the device that they were loaded to."""
         self._tensors = {
             (total.device, tuple(names)): (total.clone(), count) for names, total, count in state_dict["tensors"]
         }
         self._floats = dict(state_dict["floats"])
 
     def pop(self) -> dict[str, float]:
-        """Returns the means by name, in order of first appearance, and starts anew. Copies once from each device."""
+        """Return the means by name, and start new ones. Copies once from each device."""
         totals: dict[str, tuple[float, int]] = dict(self._floats)
         for device in {device for device, _ in self._tensors}:
             groups = [(names, *entry) for (where, names), entry in self._tensors.items() if where == device]
@@ -287,27 +287,27 @@ class RunningMean:
 
 @dataclass(frozen=True)
 class MetricsTable:
-    """What could be read of a `metrics.csv`."""
+    """Readable contents of a `metrics.csv`."""
 
     columns: dict[str, tuple[np.ndarray, np.ndarray]]
-    """env_steps and values, (R,) each, by name; without empty, unreadable and non-finite cells, or no entry at all."""
+    """env_steps and values of the finite cells, (R,) each, by column name; columns without any are left out."""
     env_steps: np.ndarray
-    """(R,) of all rows."""
+    """env_steps of all rows, (R,)."""
     problems: list[str]
-    """What was left out, one phrase each."""
+    """Descriptions of what was left out."""
 
 
 def read_rows(path: Path) -> tuple[list[str], list[list[str]], list[str]]:
-    """Read the complete rows; the last one may have been cut short by a kill, or is being written.
+    """Read the complete rows; the last one may be truncated by a kill, or still being written.
 
     Args:
-        path: the file.
+        path: The file.
 
     Returns:
-        The header, the rows with as many cells as it has, and what was left out, one phrase each.
+        The header, the rows with as many cells as it has, and descriptions of what was left out.
 
     Raises:
-        ValueError: this is no table of metrics.
+        ValueError: The file is not a table of metrics.
     """
     with path.open(newline="", encoding="utf-8", errors="replace") as file:
         lines = file.readlines()
@@ -331,18 +331,18 @@ def read_metrics(path: str | Path, wanted: Collection[str] | None = None) -> Met
     """Read columns of a `metrics.csv` as numbers, in the order of env_steps.
 
     Args:
-        path: the file.
-        wanted: names of columns; None for all. Those that the file does not have are left out.
+        path: The file.
+        wanted: Names of columns; None for all. Those that the file does not have are left out.
 
     Raises:
-        ValueError: this is no table of metrics, or it has no rows.
-        OSError: the file is missing or cannot be read.
+        ValueError: The file is not a table of metrics, or has no rows.
+        OSError: The file is missing or cannot be read.
     """
     header, rows, problems = read_rows(Path(path))
     if not rows:
         raise ValueError(f"{path} has no rows: nothing was logged yet.")
     steps = _numbers([row[header.index(X_AXIS)] for row in rows])
-    order = np.argsort(steps, kind="stable")[: np.isfinite(steps).sum()]  # what is not a number comes last
+    order = np.argsort(steps, kind="stable")[: np.isfinite(steps).sum()]  # NaN sorts last
     if len(order) < len(rows):
         problems.append(f"{len(rows) - len(order)} of {len(rows)} rows have no number of env_steps")
     columns, unreadable = {}, 0
@@ -361,7 +361,7 @@ def read_metrics(path: str | Path, wanted: Collection[str] | None = None) -> Met
 
 
 def _numbers(cells: list[str]) -> np.ndarray:
-    """Parse (R,); what is empty or not a number becomes NaN."""
+    """Parse cells to numbers (R,); empty and unreadable ones become NaN."""
     try:
         return np.array([float(cell) if cell else np.nan for cell in cells])
     except ValueError:
@@ -369,7 +369,7 @@ def _numbers(cells: list[str]) -> np.ndarray:
 
 
 def _is_number(cell: str) -> bool:
-    """Whether a cell is a number or, as it may be, empty."""
+    """Return whether a cell is a number or empty."""
     try:
         float(cell or "nan")
     except ValueError:

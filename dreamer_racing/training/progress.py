@@ -1,4 +1,4 @@
-"""What a run says of itself while it goes: a bar and a table in a terminal, lines in a log."""
+"""Progress display of a run: a bar and a table in a terminal, lines in a log."""
 
 from __future__ import annotations
 
@@ -17,12 +17,12 @@ from dreamer_racing.training.signals import say_at_once, write_at_once
 
 
 class Shown(NamedTuple):
-    """What is shown under a word.
+    """Metrics of a column.
 
     Attributes:
-        training: the metric, of training episodes or of updates, if there is one.
-        evaluation: that of evaluations.
-        form: how its number is written.
+        training: Metric of training episodes or updates, or None.
+        evaluation: Metric of evaluations, or None.
+        form: Format specification of the number.
     """
 
     training: str | None
@@ -38,24 +38,24 @@ COLUMNS = {
     "loss": Shown("loss", None),
     "updates/s": Shown("rate/updates", None),
 }
-"""What a terminal and a log show, by the word that it is shown under."""
+"""Columns of the terminal's table and of log lines, by their titles."""
 ROWS = ("training", "evaluation")
 NOTHING = "–"
 EVALUATING = "  evaluating   {bar:24} {n_fmt} of {total_fmt} episodes"
 BAR = "{l_bar}{bar}| {n_fmt}/{total_fmt} [{elapsed}, {rate_fmt}{postfix}]"
 TEXT: dict[str, Any] = {"total": 0, "bar_format": "{desc}"}
-CLEAR_BELOW, UP = "\r\x1b[J", "\x1b[A"  # of ECMA-48, as terminals know them
+CLEAR_BELOW, UP = "\r\x1b[J", "\x1b[A"  # ECMA-48 control sequences
 
 
 class Progress:
-    """A bar and a table in a terminal; elsewhere, where carriage returns would pile up in a log, a line now and then.
+    """Shows a bar and a table in a terminal, or writes a line now and then to a log.
 
     Args:
-        total: env_steps at the end.
-        env_steps: those at the beginning, of a run that is continued.
-        updates: those at the beginning.
-        seconds: between two lines of a log.
-        shown: whether anything is; where several processes train together, one alone speaks.
+        total: env_steps at the end of the run.
+        env_steps: env_steps at its start, if it is resumed.
+        updates: Updates at its start.
+        seconds: Seconds between two lines of a log.
+        shown: Whether to show anything; of several processes only rank 0 does.
 
     Example:
         >>> progress = Progress(total=1000)
@@ -69,19 +69,19 @@ class Progress:
         self._total, self._seconds, self._shown = total, seconds, shown
         self._env_steps = env_steps
         self._left = TimeLeft(total, env_steps, updates)
-        self._evaluated = ""  # the latest evaluation, in every line until the next
-        self._since, self._from = time.monotonic(), env_steps  # of the latest line
+        self._evaluated = ""  # text of the latest evaluation, repeated in every line until the next
+        self._since, self._from = time.monotonic(), env_steps  # time and env_steps of the latest line
         self._table = LiveTable(total, env_steps) if shown and sys.stderr.isatty() else None
 
     def advance(self, env_steps: int, updates: int) -> None:
-        """Take note of how far the run is, and how many updates it has made."""
+        """Report the env_steps and updates so far."""
         self._env_steps = env_steps
         self._left.advance(env_steps, updates)
         if self._table is not None:
             self._table.advance(env_steps, str(self._left))
 
     def show(self, metrics: Mapping[str, float], unsaved: Mapping[str, int] | None = None) -> None:
-        """Show the latest numbers, and what cannot be written since which env_steps."""
+        """Show the latest metrics, and the env_steps since which named writes fail."""
         failing = "; ".join(f"{what} since {env_steps:,}" for what, env_steps in (unsaved or {}).items())
         if self._table is not None:
             self._table.show(metrics, failing)
@@ -94,27 +94,27 @@ class Progress:
             self._write_line("; ".join(part for part in parts if part))
 
     def evaluating(self, episodes: int, total: int) -> None:
-        """Show how far an evaluation is, until there are numbers to show; a log has no use for it."""
+        """Show the progress of an evaluation in a terminal."""
         self._left.disturb()
         if self._table is not None:
             self._table.evaluating(episodes, total)
 
     def say(self, text: str) -> None:
-        """Say something in a line of its own."""
+        """Write a message on its own line."""
         if self._table is not None:
             self._table.write(text)
         elif self._shown:
             _write(text, sys.stdout)
 
     def answer(self, text: str) -> None:
-        """Say something at once, from within a signal's handler, in a line of its own."""
+        """Write a message on its own line from within a signal handler."""
         if self._table is not None:
             self._table.answer(text)
         else:
             say_at_once(text)
 
     def close(self) -> None:
-        """Leave bar and table as they stand."""
+        """Stop updating bar and table, and leave them in the terminal."""
         if self._table is not None:
             self._table.close()
             self._table = None
@@ -138,9 +138,9 @@ def _listed(numbers: Mapping[str, str]) -> str:
 
 
 def _write(text: str, stream: TextIO) -> None:
-    """Write a line with the time of day, at once: what follows a log sees it as it comes.
+    """Write a line with the time of day, and flush it.
 
-    A log that takes no more, on a full disk or where nobody reads it, is no reason to end a run.
+    A write that fails, for example on a full disk or a closed pipe, is ignored.
     """
     with contextlib.suppress(OSError):
         stream.write(f"{time.strftime('%H:%M:%S')}  {text}\n")
@@ -148,19 +148,19 @@ def _write(text: str, stream: TextIO) -> None:
 
 
 class LiveTable:
-    """A bar, a table of two rows, training and evaluation, and how far an evaluation is while there is one.
+    """Progress bar, a table with the rows training and evaluation, and a bar during evaluations, in a terminal.
 
-    While it stands, what is logged to the terminal is written above it.
+    Log messages are written above it.
 
     Args:
-        total: env_steps at the end.
-        env_steps: those at the beginning, of a run that is continued.
+        total: env_steps at the end of the run.
+        env_steps: env_steps at its start, if it is resumed.
     """
 
     def __init__(self, total: int, env_steps: int = 0) -> None:
         self._draws = False
-        self._answers: list[str] = []  # that came while something was drawn
-        # One update a time at least: otherwise a thread of tqdm's draws, too.
+        self._answers: list[str] = []  # answers that arrived during drawing
+        # With miniters=1, tqdm's monitor thread does not draw as well.
         self._bar = tqdm(total=total, initial=env_steps, unit="step", dynamic_ncols=True, position=0, miniters=1,
                          bar_format=BAR)  # fmt: skip
         self._left, self._failing = "", ""
@@ -173,7 +173,7 @@ class LiveTable:
         self._logging.__enter__()
 
     def advance(self, env_steps: int, left: str) -> None:
-        """Take note of how far the run is, where the last rollout may go past the end, and what is left in words."""
+        """Show env_steps, which may exceed the total after the last rollout, and the time left as text."""
         with self._drawing():
             self._bar.total = max(self._bar.total, env_steps)
             self._left = left
@@ -181,7 +181,7 @@ class LiveTable:
             self._bar.update(env_steps - self._bar.n)
 
     def show(self, metrics: Mapping[str, float], failing: str = "") -> None:
-        """Show what is new in these metrics, beside the env_steps of now, and what cannot be written."""
+        """Update the rows that have new metrics, with the current env_steps, and show which writes fail."""
         with self._drawing():
             for number, row in enumerate(ROWS, start=1):
                 if new := numbers_of(row, metrics):
@@ -191,7 +191,7 @@ class LiveTable:
             self._note()
 
     def evaluating(self, episodes: int, total: int) -> None:
-        """Show how far an evaluation is."""
+        """Show the progress of an evaluation."""
         with self._drawing():
             if self._evaluating is None or self._evaluating.total != total:
                 self._end_evaluation()
@@ -200,12 +200,12 @@ class LiveTable:
             self._evaluating.refresh()
 
     def write(self, text: str, file: TextIO | None = None) -> None:
-        """Write a line above, to stdout if to nothing else."""
+        """Write a line above the bar, to stdout by default."""
         with self._drawing():
             self._bar.write(text, file=file)
 
     def answer(self, text: str) -> None:
-        """Write a line above from within a signal's handler: at once, or after what is being drawn."""
+        """Write a line above the bar from within a signal handler; during drawing, write it afterwards."""
         if self._draws:
             self._answers.append(text)
             return
@@ -214,7 +214,7 @@ class LiveTable:
         write_at_once(f"{CLEAR_BELOW}{text}\n{drawn}\r{UP * (len(lines) - 1)}")
 
     def close(self) -> None:
-        """Leave bar and table as they stand."""
+        """Stop updating bar and table, and leave them in the terminal."""
         with self._drawing():
             self._logging.__exit__(None, None, None)
             self._end_evaluation()
@@ -223,7 +223,7 @@ class LiveTable:
 
     @contextlib.contextmanager
     def _drawing(self) -> Iterator[None]:
-        """Stands around whatever moves the cursor; in between it is in the line of the bar."""
+        """Context of everything that moves the cursor, which otherwise stays in the line of the bar."""
         self._draws = True
         try:
             yield
@@ -233,7 +233,7 @@ class LiveTable:
                 self.answer(self._answers.pop())
 
     def _note(self, refresh: bool = True) -> None:
-        """Write beside the bar how long the run still takes, and what cannot be written."""
+        """Show the time left and the failing writes beside the bar."""
         self._bar.set_postfix_str(", ".join(filter(None, (self._left, self._failing))), refresh)
 
     def _end_evaluation(self) -> None:
@@ -242,12 +242,12 @@ class LiveTable:
             self._evaluating = None
 
     def _write(self, row: str, cells: list[str], number: int) -> None:
-        """Write a line of the table, no longer than the terminal is wide."""
+        """Write a line of the table, cut to the width of the terminal."""
         text = f"  {row:<11}" + "".join(f"{cell:>11}" for cell in cells)
         self._lines[number].set_description_str(text[: shutil.get_terminal_size().columns - 1])
 
 
 def numbers_of(row: str, metrics: Mapping[str, float]) -> dict[str, str]:
-    """Return what these metrics have for a row, one of `ROWS`, as it is shown, by its words."""
+    """Return the formatted numbers of a row (one of `ROWS`) that these metrics contain, by column."""
     names = {word: getattr(shown, row) for word, shown in COLUMNS.items()}
     return {word: f"{metrics[name]:{COLUMNS[word].form}}" for word, name in names.items() if name in metrics}

@@ -1,6 +1,6 @@
-"""Checkpoints put in their place, and out of it, so that one of its name is complete whenever a process is killed.
+"""Atomic publishing and removal of checkpoints: a folder with a checkpoint's name is complete even after a kill.
 
-Whether its files are as they were saved is told by their CRC-32, noted beside them.
+A CRC-32 of every file is stored in the checkpoint, to detect damage.
 """
 
 from __future__ import annotations
@@ -21,11 +21,11 @@ from dreamer_racing.training.directory import PREFIX, PROCESS, PROCESSES, REPLAC
 logger = logging.getLogger(__name__)
 
 CHECKSUMS = "checksums.json"
-"""The file with the CRC-32 of all others of a checkpoint, by path: against damage, not against intent."""
+"""File with the CRC-32 of all other files of a checkpoint, by path; it detects damage, not manipulation."""
 
 
 def publish(partial: Path, final: Path) -> None:
-    """Makes a checkpoint of what was written beside its place."""
+    """Turn a folder with a checkpoint's files, written under another name, into the final checkpoint."""
     _check_loadable(partial)
     write_checksums(partial)
     _sync_tree(partial)
@@ -33,7 +33,7 @@ def publish(partial: Path, final: Path) -> None:
 
 
 def _check_loadable(path: Path) -> None:
-    """Reads the state dicts back (mapped, not copied), to refuse values that only a resume would find unreadable."""
+    """Read the state dicts back (memory-mapped), so that unreadable values are found now, not at a resume."""
     for file in path.rglob(StateDictCheckpointAdapter.state_torch):
         torch.load(file, map_location="cpu", mmap=True, weights_only=True)
 
@@ -48,7 +48,7 @@ def _sync_tree(path: Path) -> None:
 
 
 def _put_in_place(partial: Path, final: Path) -> None:
-    """Renames into place. A folder cannot be renamed onto another, so an earlier one of that name steps aside."""
+    """Rename to the final name; an earlier folder of that name is renamed first, because it cannot be replaced."""
     aside = final.with_name(f".{final.name}{REPLACED}")
     if final.exists():
         os.replace(final, aside)
@@ -62,7 +62,7 @@ def _put_in_place(partial: Path, final: Path) -> None:
 
 
 def remove(path: Path) -> None:
-    """Removes a checkpoint: under another name first, so that a kill meanwhile leaves none of that name incomplete."""
+    """Remove a checkpoint; it is renamed first, so that a kill meanwhile leaves no incomplete one of that name."""
     tombstone = path.with_name(f".{path.name}.removed")
     shutil.rmtree(tombstone, ignore_errors=True)
     os.replace(path, tombstone)
@@ -70,7 +70,7 @@ def remove(path: Path) -> None:
 
 
 def remove_unfinished(directory: Path) -> None:
-    """Removes what a killed process left; puts back a checkpoint that had stepped aside for one that never came."""
+    """Remove unfinished checkpoints of a killed process; restore one that was renamed for a missing replacement."""
     for path in directory.glob(f".*{PREFIX}-*"):
         final = stepped_aside(path)
         if path.name.endswith(REPLACED) and not final.exists() and is_complete(path):
@@ -81,14 +81,14 @@ def remove_unfinished(directory: Path) -> None:
 
 
 def write_checksums(path: Path) -> None:
-    """Notes the checksum of every other file of a checkpoint, the manifest's too."""
+    """Write the checksums of all other files of a checkpoint, including the manifest."""
     files = sorted(file for file in path.rglob("*") if file.is_file() and file.name != CHECKSUMS)
     sums = {file.relative_to(path).as_posix(): _checksum(file) for file in files}
     (path / CHECKSUMS).write_text(json.dumps(sums, indent=1), encoding="utf-8")
 
 
 def damage_of(path: Path, parts: Collection[str] | None) -> str | None:
-    """Says which file of some parts is not as it was saved; None if all are."""
+    """Return a description of the first damaged file of some parts; None if all are as they were saved."""
     try:
         sums = json.loads((path / CHECKSUMS).read_text(encoding="utf-8"))
     except FileNotFoundError:
@@ -106,7 +106,7 @@ def damage_of(path: Path, parts: Collection[str] | None) -> str | None:
 
 
 def _files_of(path: Path, parts: Collection[str] | None) -> Iterator[str]:
-    """Names the files of some parts, of every process; a manifest comes first, to be compared before it is read."""
+    """Yield the files of some parts, of every process; a manifest comes first, to be checked before it is read."""
     yield "manifest.json"
     manifest = Checkpoint.manifest(path)
     for part, record in manifest["components"].items():
@@ -118,7 +118,7 @@ def _files_of(path: Path, parts: Collection[str] | None) -> Iterator[str]:
 
 
 def _checksum(file: Path) -> int | None:
-    """Returns that of a file's content; None of one that cannot be read."""
+    """Return the checksum of a file's content; None if it cannot be read."""
     checksum = 0
     try:
         with file.open("rb") as content:

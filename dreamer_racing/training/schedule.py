@@ -1,6 +1,6 @@
-"""What changes while a run goes on: scheduled settings, how much it trains, and whether the policy waits for its model.
+"""Schedules of hyperparameters, the replay ratio, and the check whether the policy should wait for its world model.
 
-Settings change by the run's length or by how well the policy flies.
+Scheduled hyperparameters change with the run's env_steps or with the policy's gate pass rate.
 """
 
 from __future__ import annotations
@@ -26,31 +26,32 @@ from dreamer_racing.training.episodes import GatePassRate
 logger = logging.getLogger(__name__)
 
 ERRORS = ("privileged_error", "image_error", "loss_vector", "reward_error")
-"""Metrics of a world model by which a lag is told, best first."""
+"""Metrics of a world model by which a lag can be measured, best first."""
 LOOKS = 5
-"""Measurements of which the median counts, so that one of an odd flight does not [choice]."""
+"""Number of latest measurements whose median is used, so that a single unusual flight does not count [choice]."""
 PATIENCE = 10
-"""Measurements for which a policy waits at most; then the ratio has to fall below the limit first [choice]."""
+"""Maximum number of measurements that a policy waits; it waits again only after the ratio fell below the limit
+[choice]."""
 
 
 class RampClock(Enum):
-    """What a ramp goes by, a number from 0 to 1."""
+    """Progress measure of a ramp, a number from 0 to 1."""
 
     run = "run"  # share of the run's env_steps
-    passes = "passes"  # best share of flights that pass the hardest gate, `GatePassRate.best`
-    known = "known"  # the same, and on by itself once that gate is known, `GatePassRate.known`
+    passes = "passes"  # best pass rate of the gate with the lowest pass rate, `GatePassRate.best`
+    known = "known"  # the same, but also rises with time once that rate reached `KNOWN`, `GatePassRate.known`
 
 
 @dataclass
 class Ramp:
-    """A setting that moves linearly from its own value to another, between two times of its clock.
+    """Linear change of a hyperparameter from its configured value to another, between two times of a clock.
 
     Attributes:
-        to: Where it ends; None: it stays at its own value.
-        begin: Time at which it leaves its own value.
-        end: Time from which on it stays at ``to``.
-        by: The clock: the share of the run's env_steps that are made, or that of flights that pass the hardest gate,
-            with time or without.
+        to: Final value; None keeps the configured value.
+        begin: Time at which the change begins.
+        end: Time at which ``to`` is reached.
+        by: Clock: ``run`` is the share of the run's env_steps; ``passes`` is the pass rate of the gate with the lowest
+            one; ``known`` is the same, but rises with time, too, once a threshold is reached.
 
     Example:
         >>> Ramp(to=0.99, begin=0.5, end=1.0).at(0.98, {RampClock.run: 0.75})
@@ -63,13 +64,13 @@ class Ramp:
     by: RampClock = RampClock.run
 
     def check(self, name: str) -> None:
-        """Refuse a ramp that ends before it begins, or lies outside the run.
+        """Check that 0 <= begin <= end <= 1.
 
         Args:
-            name: Of the setting, for the message.
+            name: Name of the hyperparameter, for the message.
 
         Raises:
-            ValueError: The message gives both ends.
+            ValueError: It is not so; the message gives both ends.
         """
         if not 0.0 <= self.begin <= self.end <= 1.0:
             raise ValueError(
@@ -77,11 +78,11 @@ class Ramp:
             )
 
     def at(self, value: float, times: Mapping[RampClock, float]) -> float:
-        """Return the setting at a time.
+        """Return the value at a time.
 
         Args:
-            value: Its own value, where it begins.
-            times: What the clocks say; beyond 1 counts as 1.
+            value: Configured value, from which the ramp starts.
+            times: Time of each clock; above 1 counts as 1.
         """
         if self.to is None:
             return value
@@ -95,10 +96,10 @@ class Ramp:
 
 @dataclass
 class ScheduleConfig:
-    """Settings that move over a run, each from its own value `to` another, by its length or by the gates passed."""
+    """Ramps of hyperparameters, each from its configured value `to` another, by env_steps or by the gate pass rate."""
 
-    learning_rates: Ramp = field(default_factory=Ramp)  # `to`: share of all learning rates that is left
-    world_model_rate: Ramp = field(default_factory=Ramp)  # `to`: share of that share, of the world model's alone
+    learning_rates: Ramp = field(default_factory=Ramp)  # `to`: final factor on all learning rates
+    world_model_rate: Ramp = field(default_factory=Ramp)  # `to`: further final factor on the world model's rate
     discount: Ramp = field(default_factory=Ramp)  # loss.discount
     entropy_scale: Ramp = field(default_factory=Ramp)  # loss.entropy_scale
     min_std: Ramp = field(default_factory=Ramp)  # loss.min_std
@@ -107,20 +108,20 @@ class ScheduleConfig:
 
     @property
     def ramps(self) -> dict[str, Ramp]:
-        """All of them by name."""
+        """All ramps by name."""
         return {name: ramp for name, ramp in vars(self).items() if isinstance(ramp, Ramp)}
 
     @property
     def by_length(self) -> list[str]:
-        """Names of those that a longer run sets back."""
+        """Names of the active ramps that depend on the run's total env_steps."""
         return [name for name, ramp in self.ramps.items() if ramp.to is not None and ramp.by is not RampClock.passes]
 
     def check(self, owners: Mapping[str, Any], suite: str = "race") -> None:
-        """Refuse ramps that end before they begin, or lead where the setting itself could not be.
+        """Check the times of all ramps, and that each final value is allowed for its hyperparameter.
 
         Args:
-            owners: Configurations of the settings that move, by their names on the command line: ``loss``, ``env`` ...
-            suite: The environment; only races have gates to go by.
+            owners: Configurations that hold the hyperparameters, by their command-line names: ``loss``, ``env`` ...
+            suite: Environment suite; only races have gates.
 
         Raises:
             ValueError: The message names the ramp.
@@ -143,15 +144,15 @@ class ScheduleConfig:
             raise ValueError("schedule.start_on_line begins at env.start_on_line=0: give that a share above 0.")
 
     def check_deviations(self, loss: Any) -> None:
-        """Refuse a smallest deviation of actions above the largest, also where a ramp leads.
+        """Check that ``min_std`` stays below ``max_std`` during the ramps of both.
 
-        Bounds that move on one clock are compared at its begin and at its end, others at every pair of those.
+        If both ramps have the same clock and times, the bounds are compared at begin and end, else in all combinations.
 
         Args:
-            loss: Has both bounds.
+            loss: Configuration with both bounds.
 
         Raises:
-            ValueError: The message names both settings.
+            ValueError: It does not; the message names both settings.
         """
         ramps = {"min_std": self.min_std, "max_std": self.max_std}
         lowest, highest = (
@@ -167,7 +168,7 @@ class ScheduleConfig:
 
 @dataclass
 class DreamerV3ScheduleConfig(ScheduleConfig):
-    """And of what is imagined."""
+    """Ramps of DreamerV3, including those of imagination."""
 
     imagination_horizon: Ramp = field(default_factory=Ramp)  # model.imagination_horizon, rounded
     action_change_scale: Ramp = field(default_factory=Ramp)  # loss.action_change_scale
@@ -175,15 +176,15 @@ class DreamerV3ScheduleConfig(ScheduleConfig):
 
 @dataclass
 class LatentPPOScheduleConfig(ScheduleConfig):
-    """And of an actor that learns from what was collected."""
+    """Ramps of latent PPO, and its check of the world model's lag."""
 
     kl_target: Ramp = field(default_factory=Ramp)  # loss.ppo.kl_target
-    # the actor waits while the model's error on the newest records is so many times that in training
+    # the actor waits while the model's error on the newest records is more than this factor times that in training
     wait_for_model: float | None = setting(None, Range(1, open_below=True))
     wait_every: int = setting(5_000, COUNT)  # env_steps between two measurements of those errors
 
     def check(self, owners: Mapping[str, Any], suite: str = "race") -> None:
-        """As `ScheduleConfig.check`; and refuse a target of the divergence that updates stop short of."""
+        """Check as `ScheduleConfig.check` does, and that ``kl_stop`` is well above the largest ``kl_target``."""
         super().check(owners, suite)
         ppo, to = owners["loss.ppo"], self.kl_target.to
         if ppo.kl_target is None and to is not None:
@@ -200,25 +201,25 @@ class LatentPPOScheduleConfig(ScheduleConfig):
 
 
 SHARES_OF_RATES = ("learning_rates", "world_model_rate")
-"""Ramps that begin at 1, and are no setting's own."""
+"""Ramps of factors, which start at 1 instead of a configured value."""
 ALWAYS = (*SHARES_OF_RATES, "min_std", "max_std", "kl_target")
-"""What a learner is told of also where it does not move. The networks hold the bounds of deviations, and what a
-checkpoint brings of another run's gives way to this run's."""
+"""Hyperparameters that are always set, even without a ramp. The networks hold the bounds of standard deviations, so
+a checkpoint of another run may bring other bounds, which this run's must replace."""
 
 
 def owner_of(name: str, owners: Mapping[str, Any]) -> Any:
-    """Return the configuration that has a setting of a name."""
+    """Return the configuration that has a field of this name."""
     return next(owner for owner in owners.values() if hasattr(owner, name))
 
 
 class Schedule:
-    """Moves hyperparameters over a run: each from its own value along its ramp.
+    """Computes the scheduled values of hyperparameters over a run.
 
     Args:
-        config: the ramps.
-        owners: as of `ScheduleConfig.check`.
-        total_env_steps: of the run.
-        num_gates: of the track; 0: there is no race, and no ramp goes by its gates.
+        config: Ramps.
+        owners: As for `ScheduleConfig.check`.
+        total_env_steps: Length of the run.
+        num_gates: Number of gates of the track; 0 without a race, when no ramp may depend on gates.
 
     Example:
         >>> from dreamer_racing.losses import LossConfig
@@ -241,11 +242,11 @@ class Schedule:
         self.pass_rate = GatePassRate(num_gates)
 
     def observe(self, episodes: TensorDictBase, env_steps: int) -> dict[str, float]:
-        """Take note of the gates that finished episodes passed, by which some ramps go; return metrics.
+        """Update the gate pass rate, which some ramps depend on, by finished episodes; return metrics.
 
         Args:
             episodes: Batch ``[E]`` of ``EpisodeTracker.update``.
-            env_steps: Made so far.
+            env_steps: env_steps so far.
         """
         if not len(episodes) or "gates_passed" not in episodes:
             return {}
@@ -253,7 +254,7 @@ class Schedule:
         return {"episode/pass_share": share, "episode/hardest_gate": float(self.pass_rate.hardest_gate)}
 
     def at(self, env_steps: int) -> dict[str, float]:
-        """Return all hyperparameters after so many env_steps, by the names that a learner's ``adjust`` has for them."""
+        """Return all scheduled hyperparameters at ``env_steps``, by their names in a learner's ``adjust``."""
         times = {
             RampClock.run: env_steps / self.total_env_steps,
             RampClock.passes: self.pass_rate.best,
@@ -271,14 +272,13 @@ class Schedule:
 
 
 class ReplayRatio:
-    """So many records trained on per environment step made since the prefill.
+    """Computes the number of updates due from the replay ratio, the records trained on per environment step.
 
-    A run that goes on with another ratio makes the updates that the one before asked for until there, no more and no
-    less.
+    If a run is resumed with another ratio, the updates due before that point still follow the old one.
 
     Args:
-        ratio: records trained on per environment step.
-        records: that an update trains on.
+        ratio: Records trained on per environment step after the prefill.
+        records: Records per update.
         prefill: env_steps collected before the first update.
 
     Example:
@@ -289,21 +289,21 @@ class ReplayRatio:
 
     def __init__(self, ratio: float, records: int, prefill: int = 0) -> None:
         self.ratio, self.records, self.prefill = ratio, records, prefill
-        self._env_steps = 0  # when it was last asked
-        self._since, self._before = 0, 0  # env_steps from which it holds, and updates that were asked for until there
+        self._env_steps = 0  # at the latest call of `updates_due`
+        self._since, self._before = 0, 0  # env_steps from which this ratio applies, and updates due before them
 
     def updates(self, env_steps: int) -> int:
-        """Return the updates to make from the run's beginning until so many env_steps."""
+        """Return the number of updates due from the start of the run until ``env_steps``."""
         steps = env_steps - max(self.prefill, self._since)
         return self._before + max(0, int(steps * self.ratio / self.records))
 
     def updates_due(self, env_steps: int, made: int = 0) -> int:
-        """Return the updates to make at so many env_steps, where some are made already."""
+        """Return the number of updates to make now, at ``env_steps``, after ``made`` updates."""
         self._env_steps = env_steps
         return max(0, self.updates(env_steps) - made)
 
     def state_dict(self) -> dict[str, Any]:
-        """Return the numbers of the ratio, since when it holds, and how far the run is."""
+        """Return the ratio, since when it applies, and the latest env_steps."""
         return {
             "ratio": self.ratio,
             "records": self.records,
@@ -314,7 +314,7 @@ class ReplayRatio:
         }
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Go on where a run was saved; another ratio than there holds from there on, which is logged."""
+        """Restore what `state_dict` returned; if the ratio has changed, log it, and apply the new one from here on."""
         saved = ReplayRatio(state["ratio"], state["records"], state["prefill"])
         saved._since, saved._before = state["since"], state["before"]
         self._env_steps = state["env_steps"]
@@ -326,16 +326,16 @@ class ReplayRatio:
 
 
 class ModelLag:
-    """Compares a world model's error on fresh records with that on those it is trained on.
+    """Compares a world model's error on the newest records with its error in training.
 
-    A policy that improves faster than its model flies where the model errs, and finds those of its errors that promise
-    most. Then the fresh records' error stands above the other, and the policy should wait.
+    A policy that improves faster than its model reaches states where the model is wrong, and exploits the errors that
+    promise the most reward. Then the error on the newest records exceeds that in training, and the policy should wait.
 
-    Fresh are the newest records of all worlds: those of one that is held out follow single odd flights. They are harder
-    than older ones where flights get faster, so a ratio somewhat above one is no lag yet.
+    The newest records are those of all environments: those of a single held-out one vary too much from flight to
+    flight. While flights get faster, new records are harder than old ones, so a ratio slightly above 1 is no lag.
 
     Args:
-        limit: Ratio of the two above which the policy waits; None: it never does, and nothing is measured.
+        limit: Ratio of these errors above which the policy waits; None turns the measurement off.
         every: env_steps between two measurements.
 
     Example:
@@ -351,11 +351,11 @@ class ModelLag:
     def __init__(self, limit: float | None, every: int = 1) -> None:
         self.limit = limit
         self._every = every
-        self._periods = 0  # of the run, that were looked at
-        self._sum: Tensor | float = 0.0  # of the errors of updates since the last measurement
+        self._periods = 0  # number of the latest period
+        self._sum: Tensor | float = 0.0  # sum of training errors since the last measurement
         self._count = 0
         self._ratios = deque[float](maxlen=LOOKS)
-        self._above = 0  # measurements without a break at which the median was above the limit
+        self._above = 0  # consecutive measurements with a median above the limit
 
     @property
     def waits(self) -> bool:
@@ -363,25 +363,25 @@ class ModelLag:
         return self.limit is not None and 0 < self._above <= PATIENCE
 
     def due(self, env_steps: int) -> bool:
-        """Return whether another period has passed, in which the newest records are to be measured."""
+        """Return whether a new period has begun, so that a measurement is due."""
         periods = env_steps // self._every
         passed, self._periods = self.limit is not None and periods != self._periods, periods
         return passed
 
     def trained(self, metrics: Mapping[str, Tensor]) -> None:
-        """Take note of the error in an update's metrics, a scalar; nothing waits for its device."""
+        """Add the error in an update's metrics, without waiting for the device."""
         if self.limit is not None and (error := error_of(metrics)) is not None:
             self._sum = self._sum + error.detach()
             self._count += 1
 
     def measured(self, metrics: Mapping[str, Tensor]) -> dict[str, Tensor | float]:
-        """Take note of the error on fresh records, and decide whether the policy waits, which is logged.
+        """Add the error on the newest records, decide whether the policy waits, and log changes of the decision.
 
         Args:
-            metrics: of the world model on these records, of which one is in `ERRORS`.
+            metrics: Metrics of the world model on these records, with one of `ERRORS`.
 
         Returns:
-            Metrics; the ratio is a median of the last ones. None where no error was measured.
+            Metrics, of which the ratio is the median of the latest ones; empty if there is no such error.
         """
         if (fresh := error_of(metrics)) is None:
             return {}
@@ -418,5 +418,5 @@ class ModelLag:
 
 
 def error_of(metrics: Mapping[str, Tensor]) -> Tensor | None:
-    """Return the error by which a lag is told, of a world model's metrics; None if none of them was measured."""
+    """Return the best error of `ERRORS` in a world model's metrics; None if there is none."""
     return next((metrics[name] for name in ERRORS if name in metrics), None)

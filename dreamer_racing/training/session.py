@@ -1,10 +1,10 @@
-"""A training session: what stands around the loop of a recipe.
+"""Training session: everything around the loop of a recipe.
 
-The recipe collects and learns in a loop of its own. The session holds the run directory, restores and saves all parts,
+The recipe has the loop that collects and learns. The session locks the run directory, restores and saves all parts,
 counts, logs, evaluates, shows progress, and ends the loop at `total_env_steps` or on a signal.
 
-Several processes may train together (`parallel`): they go through the loop in step, each with worlds and replay of its
-own; counters and what is learnt from episodes are of all, and the first alone logs and evaluates.
+Several processes may train together (`parallel`): they run the loop in lockstep, each with its own environments and
+replay; counters and statistics of episodes cover all processes, and only rank 0 logs and evaluates.
 """
 
 from __future__ import annotations
@@ -39,47 +39,47 @@ from dreamer_racing.training.signals import GracefulExit
 logger = logging.getLogger(__name__)
 
 OF_EACH_PROCESS = ("env", "tracker", "collector", "replay", "storage")
-"""Parts that each of several processes has of its own; `storage` keeps the steps of its worlds."""
+"""Parts that differ between processes; `storage` holds collected steps of the process's environments."""
 OF_WORLDS = ("env", "collector")
-"""Parts that a run does not have where workers fly; where it goes on without them, its worlds begin anew."""
+"""Parts that a run with workers does not have; if a checkpoint lacks them, the environments are reset on resume."""
 
 FIRST_CHECKPOINT = 1.5
-"""Minutes after which a run that saves on the way does so first: within two of its start [choice]."""
+"""Minutes until the first checkpoint of a run that saves during training: within two of its start [choice]."""
 
 
 class Evaluator(Protocol):
     """Evaluates a learner's policy."""
 
     on_episode: Callable[[int, int], None] | None
-    """Is told how many episodes have ended, and of how many."""
+    """Called with the number of finished episodes and the total."""
     attempt: Callable[[str], AbstractContextManager]
-    """Stands around writes without which an evaluation counts all the same, by what they are of."""
+    """Makes the context manager of writes that may fail without failing the evaluation; see `Session.attempt`."""
 
     def make(self, env_steps: int, stochastic: bool = False) -> dict[str, float]:
-        """Evaluate, write what there is to look at, return metrics."""
+        """Evaluate the policy, write plots and videos, and return metrics."""
         ...
 
     def close(self) -> None:
-        """Free simulators."""
+        """Close the simulators."""
         ...
 
 
 class Session:
-    """Everything of a training run but its algorithm.
+    """Training run without its algorithm.
 
     Args:
-        config: of the recipe: any object with the fields `total_env_steps`, `seed`, `resume`, `logger` (`every`,
+        config: Config of the recipe: any object with the fields `total_env_steps`, `seed`, `resume`, `logger` (`every`,
             `media`), `evaluation` (`every`, `first`, `stochastic`) and `checkpoint` (`every`, `minutes`, `keep`).
-        lock: holds the run directory.
-        note_start: writes what the run is started with to its directory, at so many env_steps.
-        make_loggers: makes what takes metrics beside ``metrics.csv``, for a run that goes on behind its row at so many
-            env_steps, or a new one (None).
+        lock: Lock of the run directory.
+        note_start: Function of env_steps that records the start and its configuration in the run directory.
+        make_loggers: Makes the loggers besides ``metrics.csv``; its argument is the env_steps of the last row that a
+            resumed run keeps, or None for a new run.
 
     Attributes:
-        counters: `env_steps`, `updates` and `episodes` made so far.
-        clock: of the whole run.
-        began: whether the loop is under way; errors before that are for the person who started the run.
-        parts: what is saved, by name; see `track`.
+        counters: Numbers of `env_steps`, `updates` and `episodes` so far.
+        clock: Clock of the whole run.
+        began: Whether the loop has started; errors before that are mistakes of the user's configuration.
+        parts: Parts that are saved, by name; see `track`.
 
     Example:
         >>> # session.track(learner=learner, env=env, rollouts=rollouts, evaluator=evaluator, tracker=tracker)
@@ -123,32 +123,32 @@ class Session:
         self._periods = Periods({"evaluate": config.evaluation.first}, **every)
         self._minutes = Interval(config.checkpoint.minutes, FIRST_CHECKPOINT if config.checkpoint.every else 0.0)
         self._memory = KeptMemory()
-        self._unsaved: dict[str, int] = {}  # since which env_steps what cannot be written
+        self._unsaved: dict[str, int] = {}  # by name of what cannot be written: env_steps since when
         self._stack = ExitStack()  # signals and progress
         self._stop = GracefulExit()
         self._progress = Progress(0, shown=False)
-        self._due: dict[str, bool] = {}  # what was asked for after this rollout
-        self._saves = False  # after this rollout
-        self._another_follows = False  # a rollout that was under way comes before anything is evaluated or saved
+        self._due: dict[str, bool] = {}  # what is due after this rollout, once asked
+        self._saves = False  # whether to save after this rollout
+        self._another_follows = False  # whether another rollout is delivered before evaluating or saving
 
     @property
     def env_steps(self) -> int:
-        """Control steps made so far, summed over environments."""
+        """Control steps so far, summed over environments."""
         return self.counters["env_steps"]
 
     @property
     def at_end(self) -> bool:
-        """Whether all env_steps are made."""
+        """Whether the run has reached its total env_steps."""
         return self.env_steps >= self.config.total_env_steps
 
     @property
     def stopping(self) -> bool:
-        """Whether a signal has come; where several processes train, all must ask equally often."""
+        """Whether a signal has come; all processes must read it equally often."""
         return self._stop.requested
 
     @property
     def timed(self) -> Callable[[str], AbstractContextManager]:
-        """Context manager by the name of an activity, which counts the time spent inside."""
+        """Function from the name of an activity to a context manager that adds up the time spent inside."""
         return self.clock.timed
 
     def track(
@@ -163,17 +163,17 @@ class Session:
         may_lack: Sequence[str] = (),
         **parts: Any,
     ) -> None:
-        """Take the parts of the run, all of which checkpoints hold; restore them if the run is resumed.
+        """Register the parts of the run, which checkpoints hold; restore them if the run is resumed.
 
         Args:
-            learner: as `Learner`.
-            env: to train in; where workers fly, it is closed with the session and not saved.
-            rollouts: what is collected.
-            evaluator: of the learner's policy.
-            tracker: finds the finished episodes in rollouts.
-            best: parts that are kept with the learner at the best evaluation.
-            may_lack: parts that checkpoints may lack.
-            parts: others by name, as `RunCheckpoints` takes them.
+            learner: A `Learner`.
+            env: Training environment; if workers collect, it is closed with the session and not saved.
+            rollouts: Source of rollouts.
+            evaluator: Evaluator of the learner's policy.
+            tracker: Finds the finished episodes in rollouts.
+            best: Names of parts that the best checkpoint holds besides the learner.
+            may_lack: Names of parts that a checkpoint may lack.
+            parts: Further parts by name, as `RunCheckpoints` takes them.
         """
         self.learner, self.env, self.collected = learner, env, rollouts
         self.evaluator, self.tracker = evaluator, tracker
@@ -190,7 +190,7 @@ class Session:
             rollouts.begin_at(self.env_steps)
         kept = ("learner", "counters", *best)
         self.best = BestCheckpoint(path, {name: self.parts[name] for name in kept}, self.env_steps)
-        parallel.together(lambda: None)  # all have read what is written anew now
+        parallel.together(lambda: None)  # a barrier: all have read the files that are now rewritten
         if parallel.is_first():
             self.directory.set_aside_after(self.env_steps)
             self._note_start(self.env_steps)
@@ -199,17 +199,17 @@ class Session:
         logger.info("run directory: %s", path)
 
     def rollouts(self) -> Iterator[TensorDictBase | None]:
-        """Yield rollouts ``[N, T]`` until all env_steps are made or a signal came; then save everything.
+        """Yield rollouts ``[N, T]`` until the total env_steps are reached or a signal came; then save everything.
 
-        A resumed run gets None at first: what it had left to do, updates, an evaluation or a row of metrics, comes
-        before anything is collected. A rollout that is under way where the run ends or is saved is delivered first.
+        A resumed run first yields None, so that updates, evaluations or metric rows which were still due come before
+        new rollouts. If a rollout is in progress when the run is saved or ends, it is delivered first.
 
         Raises:
-            SystemExit: a signal came; everything is saved, and the status is the shell's for that signal.
-            KeyboardInterrupt: another came meanwhile, which is its argument; what is since the last checkpoint is lost.
-            WorkerError: what is collected elsewhere cannot be had; all that was delivered is saved.
-            RunCheckpointError: at its end the run could not be saved.
-            OSError: at its end metrics could not be written.
+            SystemExit: A signal came; everything is saved, and the status is the shell's for that signal.
+            KeyboardInterrupt: A second signal came, which is the argument; the run since the last checkpoint is lost.
+            WorkerError: Workers failed; everything that was delivered is saved.
+            RunCheckpointError: The run could not be saved at its end.
+            OSError: Metrics could not be written at its end.
         """
         self._begin()
         if self.env_steps:
@@ -219,7 +219,7 @@ class Session:
             while not (self.at_end or self.stopping):
                 with self.clock.timed("collect"):
                     rollout = next(self.collected, None)
-                if rollout is None:  # only a stop ends them, if the next would not be there soon
+                if rollout is None:  # only on a stop, if the next rollout would take too long
                     break
                 yield from self._deliver(rollout)
         except WorkerError:
@@ -231,7 +231,7 @@ class Session:
         self._end()
 
     def _deliver(self, rollout: TensorDictBase) -> Iterator[TensorDictBase]:
-        """Yield a rollout, and after it the one under way where the run is to be saved, evaluated last or ended."""
+        """Yield a rollout, and also the one in progress if the run is to be saved or ends."""
         self._count(rollout)
         under_way = self.collected.drain() if self._saves or self.at_end else None
         self._another_follows = under_way is not None
@@ -241,12 +241,12 @@ class Session:
             yield under_way
 
     def _count(self, rollout: TensorDictBase | None, saves: bool = False) -> None:
-        """Account for a rollout that is about to be delivered, and see what is due after it."""
+        """Count a rollout that is about to be delivered, and decide whether to save after it."""
         if rollout is not None:
             self.counters["env_steps"] += rollout.numel() * parallel.count()
             self._progress.advance(self.env_steps, self.counters["updates"])
         by_steps = self._periods.due("save", self.env_steps)
-        by_minutes = parallel.agreed(self._minutes.due())  # both take note
+        by_minutes = parallel.agreed(self._minutes.due())  # not short-circuited: both must be updated
         self._saves = saves or by_steps or by_minutes
         self._due = {}
         self._another_follows = False
@@ -255,7 +255,7 @@ class Session:
         """Log the episodes that ended in a rollout, of all processes.
 
         Returns:
-            Those episodes, batch ``[E]`` of `EpisodeTracker.update`.
+            Finished episodes, batch ``[E]`` of `EpisodeTracker.update`.
         """
         episodes = parallel.gathered_rows(self.tracker.update(rollout))
         self.counters["episodes"] += len(episodes)
@@ -268,7 +268,7 @@ class Session:
         self.metrics.push(metrics)
 
     def updates(self, due: int) -> Iterator[int]:
-        """Yield the numbers of so many updates, and count them; after a signal a resumed run makes the rest."""
+        """Yield the numbers of ``due`` updates, and count them; stop after a signal (a resumed run makes the rest)."""
         for number in range(due):
             if self.stopping:
                 return
@@ -276,10 +276,10 @@ class Session:
             self.counters["updates"] += 1
 
     def due(self, name: str) -> bool:
-        """Return whether it is time to ``evaluate`` or to ``log``, in the process that does it.
+        """Return whether to ``evaluate`` or to ``log`` now; always False in ranks other than 0.
 
-        After an evaluation, metrics are logged too, so that its numbers stand where they were measured. Nothing is due
-        where a signal came: a resumed run has updates to make first.
+        After an evaluation, metrics are also logged, so that its numbers get the env_steps at which they were measured.
+        Nothing is due after a signal, because the resumed run has updates to make first.
         """
         if not self._due:
             ready = not self.stopping and not self._another_follows
@@ -291,7 +291,7 @@ class Session:
         return parallel.is_first() and (self._due[name] or (name == "log" and self._due["evaluate"]))
 
     def evaluate(self) -> None:
-        """Evaluate, without a trace in the random numbers of training, and keep the best."""
+        """Evaluate without changing training's random state, and save the best checkpoint if the score is higher."""
         self.learner.check_finite()
         self.collected.wait()
         devices = [self.learner.device] if self.learner.device.type == "cuda" else []
@@ -302,7 +302,7 @@ class Session:
                 with self.attempt("pictures for loggers"):
                     log_evaluation(self.metrics.loggers, self.directory, self.env_steps)
         self.log(metrics)
-        # Gates first, return where the gates are the same: a return lies far below a million.
+        # Rank by gates, then by return, which is far below a million.
         score = 1e6 * metrics.get("evaluation/gates_per_episode", 0.0) + metrics["evaluation/return_mean"]
         best = ""
         with self.attempt("the best checkpoint"):
@@ -314,13 +314,13 @@ class Session:
 
     @contextmanager
     def undisturbed(self) -> Iterator[None]:
-        """Stand around measurements that set the random numbers of this process back: nothing else draws meanwhile."""
+        """Context of measurements that reset this process's random generator: collection does not draw meanwhile."""
         self.collected.wait()
         with self.clock.timed("measure"):
             yield
 
     def write_row(self, metrics: Mapping[str, Tensor | float] | None = None) -> None:
-        """Write the averages of what was logged since the latest row, and these metrics, and show them."""
+        """Write and show a row: the averages of the metrics logged since the latest row, and of these metrics."""
         self.log(self.clock.read())
         self.log(metrics or {})
         values = self.metrics.close_row(self.env_steps)
@@ -329,24 +329,24 @@ class Session:
         self._progress.show(values, self._unsaved)
 
     def save_if_due(self) -> None:
-        """Save everything if it is time to, by env_steps or by the clock."""
+        """Save everything if it is due by env_steps or by time."""
         if self._saves and not self._another_follows and not self.stopping:
             with self.attempt("checkpoint"):
                 self.save()
 
     def save(self) -> Path:
-        """Save everything, unless the networks have just been spoilt, or differ between processes."""
+        """Save everything, unless an update was not finite or the networks differ between processes."""
         with self.clock.timed("save"):
-            self.learner.check_finite()  # first: weights that are no numbers are never the same
+            self.learner.check_finite()  # first, because NaN weights never compare equal
             parallel.check_same(getattr(self.learner, "weights", []))
             return self.checkpoints.save(self.env_steps, self.clock.total)
 
     @contextmanager
     def attempt(self, what: str) -> Iterator[None]:
-        """Stand around a write that may fail, as on a full disk, without ending the run: it is said, at once and on.
+        """Context of a write that may fail, for example on a full disk; the failure is shown until one succeeds.
 
         Args:
-            what: is written.
+            what: Name of what is written.
         """
         try:
             yield
@@ -359,19 +359,19 @@ class Session:
 
     @property
     def last_good(self) -> str:
-        """Which checkpoint is left when training breaks off."""
+        """Description of the latest checkpoint, for the message when training fails."""
         try:
             return f"the last good checkpoint is {latest_checkpoint(self.directory.path)}"
         except FileNotFoundError:
             return "there is no checkpoint yet"
 
     def close(self) -> None:
-        """End collection; free simulators and files, those of a replay in the run directory too."""
+        """End collection, close simulators and files, and delete the files of a memory-mapped replay."""
         self._stack.close()
         if self.parts:
             self.collected.close()
             if not self.collected.has_worlds:
-                self.env.close()  # which else belongs to the collector
+                self.env.close()  # else the collector closes it
             self.collected.collector.shutdown()
             shutil.rmtree(self.directory.replay, ignore_errors=True)
             self.evaluator.close()
@@ -381,7 +381,7 @@ class Session:
             self._lock.abandon()
 
     def _begin(self) -> None:
-        """Take signals and show progress from here on."""
+        """Start to handle signals and to show progress."""
         self.began = True
         self._stop = self._stack.enter_context(graceful_exit())
         total, shown = self.config.total_env_steps, parallel.is_first()
@@ -392,10 +392,10 @@ class Session:
         self.evaluator.attempt = self.attempt
         self.collected.stopping = lambda: self._stop.signal_name is not None
         if shown and self.directory.finished_env_steps() > self.env_steps:
-            self.directory.finished.unlink()  # it goes on from before its end, which is to be reached again
+            self.directory.finished.unlink()  # the run resumes from before its end
 
     def _end(self) -> None:
-        """Save, and say how the run ended."""
+        """Save everything, and report how the run ended."""
         saved = self.save()
         if self.stopping:
             at = f"at {self.env_steps:,} of {self.config.total_env_steps:,} env_steps"
@@ -410,6 +410,6 @@ class Session:
 
 
 def graceful_exit() -> GracefulExit:
-    """Make the flag that a signal raises, in all processes together; one of them answers."""
+    """Make the stop flag that a signal sets in all processes; only rank 0 prints an answer."""
     answer = "saving; again: abandons what is since the last checkpoint" if parallel.is_first() else ""
     return GracefulExit(answer, parallel.largest if parallel.count() > 1 else None)

@@ -1,4 +1,4 @@
-"""A graceful end on a signal."""
+"""Graceful end of a run on a signal."""
 
 from __future__ import annotations
 
@@ -20,17 +20,17 @@ ENDING = [number for number in (signal.SIGINT, signal.SIGTERM, HANG_UP) if numbe
 class GracefulExit:
     """Turns SIGINT, SIGTERM and SIGHUP into a flag that a loop polls; a second signal raises `KeyboardInterrupt`.
 
-    A signal that is ignored, as SIGHUP under `nohup` and SIGINT in a shell's background, stays ignored. SIGHUP says
-    that the terminal is gone, perhaps several times, and is no second signal. The handlers from before are put back at
-    exit. Outside the main thread, where Python allows no handlers, the flag is never set.
+    A signal that is ignored, such as SIGHUP under `nohup` and SIGINT of a shell's background job, stays ignored. SIGHUP
+    means that the terminal is gone; it may come several times, and does not count as a second signal. The previous
+    handlers are restored at exit. Outside the main thread, where Python allows no handlers, the flag is never set.
 
     Args:
-        answer: Said at once at the first signal, after its name; nothing if empty.
-        agree: Where several processes train together, what makes of each one's signal number (0: none yet) the one that
-            all go by. Then `requested` is an exchange, for which all must ask equally often.
+        answer: Text to print at the first signal, after its name; empty for none.
+        agree: If several processes train together, a reduction of their signal numbers (0: no signal) to a common one.
+            Then reading `requested` is a collective operation, so all processes must read it equally often.
 
     Attributes:
-        say: Says the answer, from within the handler: it may have interrupted a write to one of Python's streams.
+        say: Function that prints the answer from within the handler, which may have interrupted a write to a stream.
 
     Example:
         >>> with GracefulExit() as stop:
@@ -42,13 +42,13 @@ class GracefulExit:
         self.say: Callable[[str], None] = say_at_once
         self._answer = answer
         self._agree = agree
-        self._arrived = 0  # number of the signal that came to this process
+        self._arrived = 0  # number of the signal that this process received
         self.signal_name: str | None = None
         self._previous: dict[signal.Signals, Any] = {}
 
     @property
     def requested(self) -> bool:
-        """Whether a signal has arrived, at any process."""
+        """Whether any process has received a signal."""
         if self._agree and self.signal_name is None and (number := self._agree(self._arrived)):
             self.signal_name = signal.Signals(number).name
         return self.signal_name is not None
@@ -83,11 +83,11 @@ class GracefulExit:
 
 
 def say_at_once(text: str) -> None:
-    """Say something on stderr from within a signal's handler, in a line below what stands there."""
+    """Write text to stderr from within a signal handler, on a new line."""
     write_at_once(f"\n{text}\n")
 
 
 def write_at_once(text: str) -> None:
-    """Write to stderr past Python's streams, which take nothing while a write to them is interrupted."""
-    with contextlib.suppress(OSError, ValueError):  # nobody listens any more
+    """Write to stderr without Python's streams, which cannot be used while a write to them is interrupted."""
+    with contextlib.suppress(OSError, ValueError):  # stderr is closed
         os.write(sys.__stderr__.fileno() if sys.__stderr__ else 2, text.encode())

@@ -1,4 +1,4 @@
-"""The parts of a training run, made of its configuration: environment, learner, collector, replay, evaluation."""
+"""Make the parts of a training run from its configuration: environment, learner, collector, replay, evaluation."""
 
 from __future__ import annotations
 
@@ -70,30 +70,30 @@ Environment: TypeAlias = "DroneRacingEnv | ControlSuiteEnv"
 
 
 def describe_file(track: str) -> str | None:
-    """Return what a run notes of its track: of a file all that it says, as JSON; None of a built-in one."""
+    """Return the contents of a track file as JSON, to be saved with a run; None for a built-in track."""
     if track in BUILTIN_TRACKS:
         return None
-    return json.dumps(describe_track(load_track(track))).replace("$", "\\u0024")  # which OmegaConf would read
+    return json.dumps(describe_track(load_track(track))).replace("$", "\\u0024")  # OmegaConf would interpolate a $
 
 
 def worlds_device(device: torch.device, env: EnvConfig) -> str:
-    """The device for worlds: the learner's, where they have a simulator and the renderer asked for, else the CPU."""
+    """Return the device for worlds: the learner's CUDA device if simulator and renderer run there, else the CPU."""
     fits = env.suite == "race" and env.renderer in ("auto", "warp")
     return str(device) if device.type == "cuda" and fits else "cpu"
 
 
 def worlds_of(config: RunConfig) -> dict[str, Any]:
-    """Arguments of every `DroneRacingEnv` of the run: where it trains, and where it is evaluated."""
+    """Return the arguments that all `DroneRacingEnv`s of the run share, in training and evaluation."""
     return {"track": config.track_as_begun(), **config.env.arguments()}
 
 
 def make_env(config: RunConfig, num_envs: int | None = None, num_threads: int | None = None) -> Environment:
-    """Make the environment to train in, with `env.num_envs` worlds or another number.
+    """Make the training environment.
 
     Args:
         config: resolved.
-        num_envs: worlds; those of the configuration if None.
-        num_threads: that step and draw a race's worlds on a CPU; if None one a CPU, at most `OMP_NUM_THREADS`.
+        num_envs: number of worlds; None: `env.num_envs`.
+        num_threads: CPU threads that step and draw a race's worlds; None: one per CPU, at most `OMP_NUM_THREADS`.
     """
     num_envs = num_envs or config.env.num_envs
     readers = privileged_losses(config) if isinstance(config, WorldModelRunConfig) else []
@@ -115,7 +115,7 @@ def make_env(config: RunConfig, num_envs: int | None = None, num_threads: int | 
 
 
 def privileged_losses(config: WorldModelRunConfig) -> list[str]:
-    """Return what of a run reads the simulator's state in training, as on the command line."""
+    """Return the run's settings, as NAME=VALUE, that choose losses which read the simulator's state."""
     model = config.loss.world_model
     readers = {f"loss.world_model={model}": any(PRIVILEGED in target.reads for target in find_targets(model))}
     if isinstance(config, LatentPPORunConfig):
@@ -124,8 +124,8 @@ def privileged_losses(config: WorldModelRunConfig) -> list[str]:
 
 
 def make_suite(config: RunConfig, num_envs: int, seed: int, episode_steps: int | None = None) -> ControlSuiteEnv:
-    """Make worlds of the Control Suite: to evaluate, or to train in episodes of so many control steps."""
-    from dreamer_racing.envs.control_suite import ControlSuiteEnv  # opens a display where it is imported
+    """Make a Control Suite environment; for training, `episode_steps` sets the control steps of an episode."""
+    from dreamer_racing.envs.control_suite import ControlSuiteEnv  # importing it opens a display
 
     env = config.env
     return ControlSuiteEnv(
@@ -147,7 +147,7 @@ def make_evaluator(
     start_noise: float = 0.0,
     **options: Any,
 ) -> Evaluator:
-    """Make the evaluation that fits the environment; options are those of `EvaluationReport`."""
+    """Make the evaluator for the run's environment; in a race, `options` go to `EvaluationReport`."""
     if is_race(config):
         worlds = {**worlds_of(config), "start_noise": start_noise}
         return EvaluationReport(directory, learner, worlds, episodes, video_steps, **options)
@@ -157,11 +157,11 @@ def make_evaluator(
 
 
 WINDOWS, RECORDS = 32, 2_000
-"""Windows of records held out that are measured at a time, from the newest records of a world."""
+"""Held-out windows per measurement, and the newest records of a world that they are drawn from."""
 
 
 def size_of(config: WorldModelRunConfig) -> ModelSize:
-    """The networks' size, and what their states are."""
+    """Return the networks' size, with `model.sampled` and `model.state_std` filled in."""
     return replace(get_size(config.model.size), sampled=config.model.sampled, state_std=config.model.state_std)
 
 
@@ -172,11 +172,11 @@ def make_agent(config: WorldModelRunConfig, interface: Interface) -> Agent:
 
 
 def begin_with(learner: WorldModelLearner, config: WorldModelRunConfig, env: Environment) -> str:
-    """Give a new learner the weights that ``init_from`` names; return a line on what that was.
+    """Load the weights that ``init_from`` names into a new learner; return a log line that describes them.
 
     Raises:
         FileNotFoundError: there is no such run, checkpoint or agent.
-        ValueError: its networks are of another size, or were trained with another camera, control rate or loss; or its
+        ValueError: it has another model size, or was trained with another camera, control rate or loss; or its
             configuration is damaged.
     """
     source = str(config.init_from)
@@ -207,13 +207,13 @@ def begin_with(learner: WorldModelLearner, config: WorldModelRunConfig, env: Env
 def make_learner(
     config: RunConfig, interface: Interface, device: torch.device | str, seed: int | None = None
 ) -> Learner:
-    """Make the learner of a recipe's configuration, to train or to be restored.
+    """Make the learner of a configuration, for training or for restoring a checkpoint.
 
     Args:
         config: resolved.
-        interface: what is seen and done.
-        device: where it computes.
-        seed: of the initial weights; the run's if None.
+        interface: shapes of observations and actions.
+        device: of the networks.
+        seed: of the initial weights; None: the run's.
     """
     seed = config.seed if seed is None else seed
     if isinstance(config, WorldModelRunConfig):
@@ -229,7 +229,7 @@ def make_learner(
 def measure(
     session: Session, learner: WorldModelLearner, replay: StreamReplay, scheduled: Mapping[str, float]
 ) -> dict[str, Tensor | float]:
-    """Return hyperparameters as they are now, and what the model makes of the newest records not trained on."""
+    """Return the current hyperparameters, and the world model's metrics on the newest held-out records."""
     groups = zip(("world_model", "behavior"), learner.optimizer.param_groups, strict=True)
     numbers: dict[str, Any] = {f"schedule/{name}": value for name, value in scheduled.items()}
     numbers |= {f"learning_rate/{name}": group["lr"] for name, group in groups}
@@ -243,9 +243,9 @@ def measure(
 def measure_lag(
     session: Session, config: WorldModelRunConfig, learner: WorldModelLearner, replay: StreamReplay, lag: ModelLag
 ) -> dict[str, Tensor | float]:
-    """Measure whether the model knows the records of the newest flights, before they are learned from."""
+    """Measure the world model's error on the newest records, before it trains on them."""
     length = config.model.batch_length
-    if config.replay.context:  # begins warm: the newest rollout alone
+    if config.replay.context:  # windows begin with stored latents: the newest rollout suffices
         length = min(length, config.rollout_steps)
     if (windows := replay.newest(length)) is None:
         return {}
@@ -254,9 +254,9 @@ def measure_lag(
 
 
 def seed_generators(seed: int) -> None:
-    """Seed all global generators, of which torch's samples actions and latents."""
+    """Seed all global random generators; torch's samples actions and latents."""
     random.seed(seed)
-    np.random.seed(seed)  # noqa: NPY002 - what libraries draw from
+    np.random.seed(seed)  # noqa: NPY002 - libraries draw from it
     torch.manual_seed(seed)
 
 
@@ -266,14 +266,14 @@ def num_gates(env: Environment) -> int:
 
 
 def make_curriculum(config: RunConfig, env: Environment) -> BodyRateCurriculum:
-    """Make what moves the body-rate penalty of a race's rewards; elsewhere it moves nothing."""
+    """Make the curriculum of the body-rate penalty; outside races it changes nothing."""
     return BodyRateCurriculum(config.curriculum, env if is_race(config) else None)
 
 
 def make_collector(config: RunConfig, env: Environment, policy: Policy) -> Collector:
     """Make the collector of rollouts [num_envs, rollout_steps], on the worlds' device.
 
-    Worlds on a CPU have to wait for the actions of a policy on a CUDA device; beside it, all is in order by itself.
+    CPU worlds must wait for the actions of a policy on a CUDA device; on the same device, kernels run in order anyway.
     """
     return Collector(
         with_memory(env, policy.make_primer()),
@@ -295,14 +295,14 @@ def make_run_replay(
     batch: tuple[int, int],
     latents: LatentFormat | None = None,
 ) -> StreamReplay:
-    """Make the replay, on the learner's device if it has room there; say where and how large.
+    """Make the replay buffer, on the learner's device if it fits there; print its place and size.
 
     Args:
         config: resolved.
-        env: whose records it is to hold.
-        curriculum: by which old rewards are relabelled, if they are.
-        batch: windows in a batch, and records in a window.
-        latents: how they are kept with the records, if they are.
+        env: environment whose records it stores.
+        curriculum: recomputes old rewards, if `curriculum.relabel` is set.
+        batch: windows per batch, and records per window.
+        latents: format of the latents stored with the records; None: none are stored.
     """
     settings, interface, shown = config.replay, Interface.of(env), env.observation_spec.keys()
     numbers = interface.vector_dim + interface.privileged_dim
@@ -314,7 +314,7 @@ def make_run_replay(
         fits = config.device != "cpu" and size < 0.5 * available_memory(config.device)
         device = config.device if fits else "cpu"
     if files is not None:
-        shutil.rmtree(files, ignore_errors=True)  # of a run that was killed
+        shutil.rmtree(files, ignore_errors=True)  # left by a run that was killed
     check_room(size, settings.capacity, device, files)
     if files is not None:
         files.mkdir(parents=True, exist_ok=True)
@@ -334,17 +334,17 @@ def make_run_replay(
         seed=config.seed,
         transform=RelabelReward(curriculum) if curriculum.env is not None and config.curriculum.relabel else None,
         observation_keys=interface.replay_keys,
-        # The terms are those of which the curriculum recomputes rewards.
+        # The curriculum recomputes rewards from these terms.
         reward_keys=["reward", *(name for name in ("reward_base", "body_rate_norm") if name in shown)],
         latents=latents,
-        # Samples drawn ahead would not have the latents that the update before them leaves.
+        # Prefetched samples would lack the latents that the update before them stores.
         prefetch=2 if config.device != "cpu" and device == "cpu" and latents is None else None,
         **windows,
     )
 
 
 def check_room(size: int, capacity: int, device: str, files: Path | None) -> None:
-    """Refuse replays that do not fit together; each process has one, of so many bytes and records."""
+    """Refuse replays that do not all fit; each process has one of `size` bytes and `capacity` records."""
     asked = f"replay.capacity={capacity * parallel.count():,}"
     if files is not None:
         check_space(size * parallel.count(), files, asked)
@@ -353,7 +353,7 @@ def check_room(size: int, capacity: int, device: str, files: Path | None) -> Non
 
 
 def disk_needed(config: ReplayRunConfig, replay: int) -> str:
-    """Say what checkpoints with a replay of so many bytes take at their peak, and what there is for them."""
+    """Return a line on the peak disk use of checkpoints with a replay of `replay` bytes, and on the free space."""
     directory = config.run_directory
     there = sum(file.stat().st_size for file in directory.checkpoints.rglob("*") if file.is_file())
     peak, free = (config.checkpoint.keep + 1) * replay, shutil.disk_usage(directory.path).free + there
@@ -366,7 +366,7 @@ def disk_needed(config: ReplayRunConfig, replay: int) -> str:
 
 
 def make_run_evaluator(config: RunConfig, directory: Path, learner: Learner) -> Evaluator:
-    """Make the evaluation of a run during training, if this is the process that makes it."""
+    """Make the evaluator used during training; processes other than the first get one that does nothing."""
     if not parallel.is_first():
         return NoReport()
     asked = config.evaluation
@@ -374,5 +374,5 @@ def make_run_evaluator(config: RunConfig, directory: Path, learner: Learner) -> 
 
 
 def make_tracker(config: RunConfig) -> EpisodeTracker:
-    """Make what finds the finished episodes of this process's worlds."""
+    """Make the tracker of finished episodes in this process's worlds."""
     return EpisodeTracker(config.env.num_envs // parallel.count(), CrashCause if is_race(config) else None)

@@ -1,4 +1,4 @@
-"""Overrides that a recipe refuses because nothing would heed them, named as they are written, with their values."""
+"""Refuse overrides that would have no effect; messages name them as they are written, with their values."""
 
 from __future__ import annotations
 
@@ -25,11 +25,11 @@ def check_overrides(config: DictConfig, overrides: Sequence[str]) -> None:
 
 
 def check_read(config: DictConfig, overrides: Sequence[str]) -> None:
-    """Refuse settings that nothing reads as losses and replay are chosen; one's own losses may read all.
+    """Refuse settings that the chosen losses and replay do not read; losses of the user's own may read all.
 
     Args:
         config: composed.
-        overrides: as they were written; what files of a group set goes with other choices of theirs.
+        overrides: as the user wrote them; settings from the file of a group are not refused.
     """
     targets = find_targets(config.loss.world_model)
 

@@ -1,4 +1,4 @@
-"""Entry points: a recipe's `main`, given what hydra composes of the command line, or plain words on what it cannot."""
+"""Entry points: call a recipe's `main` with the configuration that hydra composes, and print errors in plain words."""
 
 import functools
 import logging
@@ -28,12 +28,12 @@ from dreamer_racing.settings import check_settings
 
 @contextmanager
 def plain_errors(applies: Callable[[], bool] = lambda: True, also: tuple[type[Exception], ...] = ()) -> Iterator[None]:
-    """Turn errors that a person can mend into one paragraph on stderr and exit status 2.
+    """Turn errors that the user can fix into one paragraph on stderr and exit status 2.
 
     Args:
-        applies: whether it does by now; during set-up only, since the same error types inside training are defects,
-            and keep their tracebacks.
-        also: further types of errors that a person can mend here.
+        applies: asked at an error whether to do so; true during set-up only, since the same types of errors inside
+            training are defects, and keep their tracebacks.
+        also: further types of errors that the user can fix here.
     """
     mended: tuple[type[Exception], ...] = (MissingMandatoryValue, ValueError, OSError, RendererUnavailableError, *also)
     try:
@@ -48,7 +48,7 @@ def plain_errors(applies: Callable[[], bool] = lambda: True, also: tuple[type[Ex
 
 @contextmanager
 def plain_disk_errors() -> Iterator[None]:
-    """Turn what a full disk does to results into a line on stderr and exit status 1."""
+    """Turn a failure to write results into one line on stderr and exit status 1."""
     try:
         yield
     except OSError as error:
@@ -57,42 +57,42 @@ def plain_disk_errors() -> Iterator[None]:
 
 
 def start_logging() -> None:
-    """Show what the package chose and why, one line each."""
+    """Print the package's log messages on stdout, one line each."""
     logging.basicConfig(level=logging.WARNING, format="%(message)s", stream=sys.stdout, force=True)
     logging.getLogger("dreamer_racing").setLevel(logging.INFO)
     logging.getLogger("torchrl").setLevel(logging.WARNING)
 
 
 def follow_quietly() -> None:
-    """Leave it to the first of several processes to say what is the same in all; warnings and errors go to stderr."""
+    """Print nothing but warnings and errors, on stderr, in a process other than the first, which prints the rest."""
     sys.stdout = Path(os.devnull).open("w", encoding="utf-8")  # noqa: SIM115 - until the process ends
     logging.basicConfig(level=logging.WARNING, format="%(message)s", stream=sys.stderr, force=True)
     logging.getLogger("dreamer_racing").setLevel(logging.WARNING)
 
 
 def new_run_dir(recipe: str, track: str) -> Path:
-    """A fresh folder name below `runs/`."""
+    """Return a new folder name below `runs/`, which ends with the time."""
     return Path("runs") / f"{recipe}_{Path(track).stem}_{datetime.now():%Y%m%d-%H%M%S}"
 
 
 def override_key(override: str) -> str:
-    """The setting that an override is of."""
+    """Return the name of the setting in an override."""
     return override.partition("=")[0].lstrip("+~")
 
 
 def as_override(name: str, text: str | Path) -> str:
-    """Write a setting that is a text so that hydra reads that text, whatever letters are in it."""
+    """Return an override that hydra parses as exactly this text, quoted if needed."""
     plain, quoted = (f"{name}={word}" for word in (text, QuotedString(str(text), Quote.single).with_quotes()))
     return plain if hydra_takes(plain) and override_value(plain) == str(text) else quoted
 
 
 def override_value(override: str) -> object:
-    """What hydra reads in an override that it takes."""
+    """Return the value that hydra parses from a valid override."""
     return OverridesParser.create().parse_override(override).value()
 
 
 def hydra_takes(override: str) -> bool:
-    """Whether hydra can read an override."""
+    """Return whether hydra can parse an override."""
     try:
         override_value(override)
     except HydraException:
@@ -101,45 +101,45 @@ def hydra_takes(override: str) -> bool:
 
 
 def merge_overrides(saved: Iterable[str], given: Sequence[str]) -> list[str]:
-    """Overrides of a run that is continued: those it was started with, replaced by the ones given now."""
+    """Return the saved overrides of a run, with those of settings that are given now replaced."""
     replaced = {override_key(override) for override in given}
     return [override for override in saved if override_key(override) not in replaced] + list(given)
 
 
 SCHEMAS: dict[str, type] = {}
-"""Dataclasses of the recipes that are loaded, by their names."""
+"""Configuration dataclasses of the imported recipes, by the recipes' names."""
 WHOLE = re.compile(r"\d{1,9}(\.\d{1,9})?[eE]\+?\d{1,2}")
-"""A number such as 1e6."""
+"""Pattern of a number such as 1e6."""
 PLAIN = {
     r"could not be converted to Integer": "is no whole number",
     r"could not be converted to Float": "is no number",
     r"is not a valid bool \(type \w+\)": "is neither true nor false",
     r"Invalid type assigned: .*Ramp.*": "a schedule has an end and times of its own, NAME.to=, .begin=, .end=",
 }
-"""What the libraries say, and what is said instead."""
+"""Patterns of the libraries' messages, and the words to print instead."""
 TEXTS = (
     "run_dir", "resume", "init_from", "checkpoint", "output", "name", "directory", "runs", "commit", "agent", "actor",
     "track", "evaluation", "run", "against", "beside", "picture", "replay", "report", "betaflight_dump",
     "flight", "vehicle",
 )  # fmt: skip
-"""Settings that are no numbers, whatever they look like."""
+"""Settings that are always text, even if they look like numbers."""
 
 
 def recipe(
     name: str, schema: type, composed: bool = False, logs: bool = True
 ) -> Callable[[Callable[[Any], None]], Callable[[], None]]:
-    """Make a function of a configuration the recipe of a name.
+    """Return a decorator that turns a function of a configuration into the entry point of a recipe.
 
-    An override that hydra does not take is said in one paragraph on stderr, with exit status 2. Ctrl-C, where the
-    recipe has no use for it, ends it with the shell's status.
+    An override that hydra refuses is explained in one paragraph on stderr, with exit status 2. Ctrl-C, unless the
+    recipe handles it, ends the process with the shell's status of that signal.
 
     Args:
-        name: of the recipe. Hydra composes the configuration from the file of this name in `config`; where there is
-            none it is the schema alone, and hydra leaves nothing behind.
+        name: of the recipe. Hydra composes the configuration from the file of this name in `config`; without
+            such a file it is the schema alone, and hydra writes no files.
         schema: dataclass of the configuration.
-        composed: whether the function takes what hydra composed, with settings left open, instead of an object of the
-            dataclass whose numbers are within their ranges, and that its method `check` takes, if it has one.
-        logs: whether what the package logs is said, on stdout; not where programs read that.
+        composed: whether the function takes hydra's `DictConfig`, in which settings may be missing, instead of an
+            object of the dataclass that has passed the checks of ranges and of its method `check`, if it has one.
+        logs: whether to print the package's log messages on stdout; False where programs read stdout.
     """
     SCHEMAS[name] = schema
     ConfigStore.instance().store(name=f"{name}_schema", node=schema)
@@ -158,9 +158,9 @@ def recipe(
 
         @functools.wraps(function)
         def start() -> None:
-            sys.excepthook = sys.__excepthook__  # packages are loaded
+            sys.excepthook = sys.__excepthook__  # imports are done: `end_quietly` is no longer needed
             sys.argv[1:] = [readable(FLAGS.get(argument, argument)) for argument in sys.argv[1:]]
-            os.environ.setdefault("HYDRA_FULL_ERROR", "1")  # errors as they are, instead of hydra's own page
+            os.environ.setdefault("HYDRA_FULL_ERROR", "1")  # raise errors, instead of hydra's own report
             try:
                 main()
             except HydraException as error:
@@ -177,7 +177,7 @@ def recipe(
 
 
 def typed(config: DictConfig) -> Any:
-    """Return an object of the dataclass of a configuration; refuse what is missing, out of its range, or by `check`."""
+    """Return a configuration as an object of its dataclass; refuse missing, out-of-range and inconsistent settings."""
     with plain_errors():
         settings: Any = OmegaConf.to_object(config)
         check_settings(settings)
@@ -187,7 +187,7 @@ def typed(config: DictConfig) -> Any:
 
 
 def schema_alone(name: str) -> dict[str, Any]:
-    """Return the configuration of a recipe that has settings of its own and chooses nothing from groups."""
+    """Return the primary configuration of a recipe without a YAML file: its schema, and no groups."""
     silent = [{f"override hydra/{kind}_logging": "none"} for kind in ("job", "hydra")]
     return {
         "defaults": [f"{name}_schema", "_self_", *silent],
@@ -196,11 +196,11 @@ def schema_alone(name: str) -> dict[str, Any]:
 
 
 def readable(argument: str) -> str:
-    """Return an override as hydra reads it.
+    """Return an argument, rewritten if hydra would misread or refuse it.
 
-    Whole numbers, one or several with commas between, get all their digits, since hydra takes 1e6 for a fraction; of
-    texts a ~ at the beginning is the user's home, and they are quoted if hydra would refuse a letter in them, unless
-    that has a meaning in lists or is a quote.
+    Whole numbers such as 1e6, also in comma-separated lists, are written out in digits, since hydra reads a float. Text
+    (`TEXTS`) that hydra would refuse is quoted, and a leading ~ replaced by the user's home, unless the text contains
+    quotes or the characters of lists and dictionaries.
     """
     name, equals, value = argument.partition("=")
     if not equals:
@@ -217,7 +217,7 @@ def _in_digits(value: str) -> str:
 
 
 def in_plain_words(error: HydraException, recipe_name: str, overrides: Sequence[str]) -> str:
-    """Say what is wrong with an override, and what would be right."""
+    """Return a message that says what is wrong with an override, and what would be right."""
     text, cause = str(error), error.__cause__
     if match := re.search(r"Could not override '(.+?)'", text):
         return no_such_setting(match[1], recipe_name)

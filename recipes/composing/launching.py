@@ -1,4 +1,4 @@
-"""Launching a recipe: from what hydra composed to a run that trains, begun or continued."""
+"""Launch a training recipe: compose its configuration, open a session, and start or resume the run."""
 
 import shlex
 import signal
@@ -47,7 +47,7 @@ from dreamer_racing.training.following import LockHeldByFirst
 from dreamer_racing.training.session import Session
 
 TRAINED_ON = ("track", "task", "decoys", "init_from", *SEEN)
-"""What a run that is resumed cannot change."""
+"""Settings that a resumed run cannot change."""
 
 
 def launch(
@@ -60,7 +60,7 @@ def launch(
 
     Args:
         config: as hydra composed it.
-        resolve: replaces what the configuration leaves open.
+        resolve: fills in the settings that the configuration leaves open.
         train: the recipe's loop, given configuration and session.
         remedy: what to lower once a loss is not finite, e.g. "ppo.learning_rate".
     """
@@ -88,7 +88,7 @@ def launch(
 
 
 def compose_run(config: DictConfig) -> tuple[DictConfig, list[str]]:
-    """Return the configuration of a run that is begun or continued, and the overrides that it is composed from."""
+    """Return the configuration of a new or resumed run, and the overrides that it is composed from."""
     overrides = given = list(HydraConfig.get().overrides.task)
     noted = None
     if config.resume:
@@ -106,12 +106,12 @@ def compose_run(config: DictConfig) -> tuple[DictConfig, list[str]]:
 
 @contextmanager
 def training_session(config: RunConfig, overrides: list[str], remedy: str) -> Iterator[Session]:
-    """Open a session for a recipe's loop; say in plain words what keeps it from beginning, and what ends it early.
+    """Open a session for a recipe's loop, and turn errors that prevent or end it into plain messages.
 
     Args:
         config: resolved.
         overrides: from which it was composed.
-        remedy: as of `launch`.
+        remedy: as in `launch`.
     """
     with plain_errors():
         session = open_session(config, overrides)
@@ -135,7 +135,7 @@ def training_session(config: RunConfig, overrides: list[str], remedy: str) -> It
             f"error: {error} Update {session.counters['updates']:,}, {session.env_steps:,} env_steps. "
             f"{keep_batch(error, kept)}; {session.last_good}. Continue from there with a lower {remedy}."
         ) from error
-    except OSError as error:  # on the way a write may fail; what is left is a disk that is full at the end
+    except OSError as error:  # failed writes are tolerated during the run, but not at its end
         raise SystemExit(f"error: {error}. The run is not finished: {session.last_good}.") from error
     except RuntimeError as error:
         if not is_out_of_memory(error):
@@ -146,10 +146,10 @@ def training_session(config: RunConfig, overrides: list[str], remedy: str) -> It
 
 
 def open_session(config: RunConfig, overrides: Sequence[str]) -> Session:
-    """Take a run directory for a session in it, if the run can work at all.
+    """Check the configuration, lock the run directory, and open a session in it.
 
     Raises:
-        ValueError: it cannot; or the directory holds another run, or is in use by a live one.
+        ValueError: a setting is invalid; or the directory holds another run, or a live run uses it.
     """
     config.check()
     directory = config.run_directory
@@ -171,7 +171,7 @@ def open_session(config: RunConfig, overrides: Sequence[str]) -> Session:
 
 
 def write_configuration(directory: RunDirectory, config: RunConfig, overrides: Sequence[str], env_steps: int) -> None:
-    """Keep what a run is started with, beside it and beside its best checkpoint."""
+    """Write a run's configuration, also beside its best checkpoint, and its overrides; note this start."""
     for place in (directory, directory.best):
         replace_text(place.config, OmegaConf.to_yaml(OmegaConf.structured(config)))
     kept = [override for override in overrides if not override.startswith("resume=")]
@@ -180,7 +180,7 @@ def write_configuration(directory: RunDirectory, config: RunConfig, overrides: S
 
 
 def make_run_loggers(config: RunConfig, directory: RunDirectory, resumed: int | None) -> list[RunLogger]:
-    """Make the loggers of a run, resumed behind its row at so many env_steps, and give them its configuration."""
+    """Make a run's loggers and log its configuration; `resumed` is the env_steps of the resumed checkpoint."""
     loggers = make_loggers(directory.path, config.logger, resumed)
     plain = cast(DictConfig, OmegaConf.create(OmegaConf.to_container(OmegaConf.structured(config), enum_to_str=True)))
     for sink in loggers:
@@ -189,7 +189,7 @@ def make_run_loggers(config: RunConfig, directory: RunDirectory, resumed: int | 
 
 
 def tell_of_thread(failure: threading.ExceptHookArgs) -> None:
-    """Say in a line that a thread could not write, which who waits for it is told too; all else has its traceback."""
+    """Print a thread's OSError in one line, since its waiting caller gets it too; other errors with traceback."""
     if isinstance(failure.exc_value, OSError):
         print(f"error in {failure.thread.name if failure.thread else 'a thread'}: {failure.exc_value}", file=sys.stderr)
     else:
@@ -197,19 +197,19 @@ def tell_of_thread(failure: threading.ExceptHookArgs) -> None:
 
 
 def keep_batch(error: NonFiniteLossError, path: Path) -> str:
-    """Keep the batch whose loss was not finite; say where, or why it could not be."""
+    """Save the batch whose loss was not finite; return where it is, or why it could not be saved."""
     try:
         torch.save(error.batch.to("cpu").to_dict(), path)
-    except (OSError, RuntimeError) as refused:  # torch's word for a full disk
+    except (OSError, RuntimeError) as refused:  # torch raises RuntimeError on a full disk
         return f"The batch could not be kept ({' '.join(str(refused).split())})"
     return f"The batch is kept in {path}"
 
 
 def resumed_config(algorithm: str, resume: str, overrides: list[str]) -> tuple[DictConfig, list[str]]:
-    """Return the configuration of the run to continue, as it was trained, with the overrides given now on top.
+    """Return the saved configuration of the run to resume with the new overrides applied, and all its overrides.
 
     Raises:
-        ValueError: it is no whole run, or another algorithm's, or an override would make another run of it.
+        ValueError: the run is incomplete or of another algorithm, or an override would make it a different run.
     """
     if is_agent(resume) or (not Path(resume).exists() and is_agent(agent_path(resume))):
         raise ValueError(f"resume={resume} is an agent, which no run goes on from: begin one with init_from={resume}.")
@@ -240,20 +240,20 @@ def resumed_config(algorithm: str, resume: str, overrides: list[str]) -> tuple[D
     merged = merge_overrides([*begun_with, as_override("run_dir", run_dir)], overrides)
     config = hydra.compose(algorithm, merged)
     keep_saved(config, known, {override_key(override) for override in overrides})
-    config.track_description = known.track_description  # whatever is taken anew
+    config.track_description = known.track_description  # even if tuned= or budget= is given
     return config, merged
 
 
 def is_finished(config: DictConfig) -> bool:
-    """Whether nothing is left of a run that is resumed, which is said.
+    """Return whether the resumed run is already complete, and print so.
 
-    If its newest checkpoint is damaged, the run goes on from the one before.
+    If its newest checkpoint is damaged, the run resumes from the one before.
     """
     directory = RunDirectory(Path(config.run_dir))
     if directory.finished_env_steps() < config.total_env_steps:
         return False
     checkpoint = newest_sound(config.resume)
-    config.resume = str(checkpoint)  # so that it is not looked for, and damage not told, again
+    config.resume = str(checkpoint)  # avoids a second search, and a second report of damage
     env_steps = env_steps_of(checkpoint)
     if env_steps < config.total_env_steps:
         return False
@@ -262,7 +262,7 @@ def is_finished(config: DictConfig) -> bool:
 
 
 def what_next(config: RunConfig, directory: RunDirectory) -> str:
-    """Say where best policy, latest film and latest plot of a finished run are, and which commands go on from there."""
+    """Return lines with a finished run's best policy, latest video and latest plot, and commands to use next."""
     left = {"run": directory.path}
     if any(directory.best.checkpoints.glob(f"{PREFIX}-*")):
         left["best policy"] = directory.best.path
@@ -272,7 +272,7 @@ def what_next(config: RunConfig, directory: RunDirectory) -> str:
     given = {name: shlex.quote(as_override(name, place)) for name in ("checkpoint", "agent", "runs", "resume")}
     moving = config.schedule.by_length if isinstance(config, WorldModelRunConfig) else []
     sets_back = f"  # sets back what moves with the share of the run: {', '.join(moving)}" if moving else ""
-    noisy = " start_noise=1" if is_race(config) else ""  # else all of the deterministic policy's flights are alike
+    noisy = " start_noise=1" if is_race(config) else ""  # without noise all deterministic flights are the same
     commands = {
         "evaluate it": f"{command('evaluate')} {given['checkpoint']} episodes=100{noisy}",
         "watch it fly": f"{command('fly')} {given['agent']}" if is_race(config) else "",

@@ -1,6 +1,6 @@
-"""What a recipe says when it does not begin: what packages it lacks, errors, and Ctrl-C; by the standard library."""
+"""Messages of a recipe that does not start: missing packages, errors, Ctrl-C. Needs only the standard library."""
 
-from __future__ import annotations  # an older Python gets to the words, too
+from __future__ import annotations  # so that an older Python reaches the messages, too
 
 import importlib.util
 import os
@@ -11,23 +11,23 @@ from pathlib import Path
 from types import TracebackType
 
 INTERRUPTED = "interrupted"
-HEAD_START = 10.0  # s that the first of several processes has to say an error; longer than it takes to end the others
+HEAD_START = 10.0  # s that other processes leave the first to print an error; longer than torchrun takes to end them
 FOR_HELP = ("dreamer_racing", "gymnasium", "yaml")
 NEEDED = (*FOR_HELP, "hydra", "torch", "mujoco")
-"""Imported by all recipes; where one is missing, this is not the project's environment."""
+"""Packages that all recipes import; if one is missing, this is not the project's environment."""
 ROOT = Path(__file__).resolve().parents[2]
 
 
 def follows() -> bool:
-    """Return whether `torchrun` started this process beside a first one."""
+    """Return whether this is one of several processes that `torchrun` started, but not the first."""
     return int(os.environ.get("WORLD_SIZE") or 1) > 1 and os.environ.get("RANK") != "0"
 
 
 def say_error(error: object) -> None:
-    """Say on stderr why nothing was begun.
+    """Print on stderr why nothing was started.
 
-    Of several processes that `torchrun` started, the first goes ahead: at its end the others are ended too, and so what
-    is wrong for all of them is said once.
+    Of several processes that `torchrun` started, the first prints at once. Its end makes torchrun end the others, which
+    wait before they print, so an error that all of them have is printed once.
     """
     if follows():
         time.sleep(HEAD_START)
@@ -35,10 +35,10 @@ def say_error(error: object) -> None:
 
 
 def end_quietly(kind: type[BaseException], error: BaseException, trace: TracebackType | None) -> None:
-    """Say what ends the interpreter, as `sys.excepthook`: for Ctrl-C, while modules are loaded, a word is enough.
+    """Print one word instead of a traceback for Ctrl-C during imports; to be installed as `sys.excepthook`.
 
-    The process then ends by that signal, as shells expect. Left to the interpreter, status 1 would come of it where
-    a function that packages registered for the exit calls `exec`, as the making of a dataclass does.
+    The process then ends by that signal, as shells expect. Left to the interpreter, the exit status would be 1 if an
+    exit handler of a package calls `exec`, as the creation of a dataclass does.
     """
     if issubclass(kind, KeyboardInterrupt):
         print(INTERRUPTED, file=sys.stderr, flush=True)
@@ -62,7 +62,7 @@ def refuse_without_packages() -> None:
 
 
 def how_to_run(script: str) -> str:
-    """Say which command starts a script of this clone with all its packages."""
+    """Return a sentence on how to run a script of this clone with all its packages."""
     if not (ROOT / "dev").is_file():
         return "Install it in this Python: pip install dreamer_racing."
     return (

@@ -1,6 +1,6 @@
-"""What a recipe answers before torch is loaded: `--help`, and slips of the pen.
+"""Print a recipe's `--help` and refuse mistyped settings, before torch is imported.
 
-Options are read from a file that `python docs/options.py` makes of the recipes' dataclasses.
+The options are read from a file that `python docs/options.py` makes from the recipes' dataclasses.
 """
 
 from __future__ import annotations
@@ -26,37 +26,37 @@ from dreamer_racing.commands import from_here, python
 FOLDER = Path(__file__).parents[1]
 CONFIG_DIR = FOLDER / "config"
 OPTIONS = CONFIG_DIR / "options.json"
-"""By recipe, the fields of every `Option`."""
+"""JSON file with the fields of every `Option`, by recipe."""
 FLAGS = {"--json": "json=true"}
-"""Settings that are customary as flags, for recipes that have them."""
+"""Flags that are accepted for settings."""
 HYDRAS_FLAGS = (
     "--cfg", "--config-dir", "--config-name", "--config-path", "--experimental-rerun", "--help", "--hydra-help",
     "--info", "--multirun", "--package", "--resolve", "--run", "--shell-completion", "--version",
 )  # fmt: skip
-"""Flags that are hydra's own; it takes the beginnings of their names, too."""
+"""Hydra's own flags; it also accepts prefixes of their names."""
 TRAINING = ("dreamer_v3", "latent_ppo", "ppo", "sac")
 """The training recipes."""
 
 
 class Option(NamedTuple):
-    """One option, or the parts of a schedule."""
+    """One option, or the fields of one schedule."""
 
     names: Sequence[str]
     default: str
     allowed: str
     meaning: str
-    free: bool  # whether entries of any name may be below it
+    free: bool  # whether it takes entries of any name
 
     @property
     def name(self) -> str:
-        """The name, and what else is set below the same."""
+        """The first name, and the last parts of the others."""
         first, *others = self.names
         return ", ".join([first, *(f".{other.rpartition('.')[2]}" for other in others)])
 
 
 @cache
 def all_options() -> dict[str, list[Option]]:
-    """Return the options of all recipes, by their names."""
+    """Return the options of all recipes, by the recipes' names."""
     read = json.loads(OPTIONS.read_text(encoding="utf-8"))
     return {recipe: [Option(*fields) for fields in rows] for recipe, rows in read.items()}
 
@@ -67,7 +67,7 @@ def options(recipe: str) -> list[Option]:
 
 
 def groups(recipe: str) -> dict[str, list[str]]:
-    """Return the configuration groups that a recipe composes, and what there is to choose in each."""
+    """Return the configuration groups of a recipe, and the choices in each."""
     path = CONFIG_DIR / f"{recipe}.yaml"
     defaults = yaml.safe_load(path.read_text(encoding="utf-8")).get("defaults", []) if path.is_file() else []
     named = [name for entry in defaults if isinstance(entry, dict) for name in entry if "/" not in name]
@@ -92,15 +92,15 @@ RENAMED = {
     "loss.ppo.updates": "actors no longer learn by PPO from what they imagine",
     "loss.kl_mode": "free nats apply to the sum over latents, as in the reference",
 }
-"""What became of settings that were there before."""
+"""Explanations for settings that were renamed or removed."""
 
 
 def no_such_setting(name: str, recipe: str) -> str:
-    """Say that there is no setting of a name, and which may be meant."""
+    """Return a message that a recipe has no setting of this name, with the one that may be meant."""
     if name in RENAMED:
         return f"{name}: {RENAMED[name]}. docs/options.md has all settings."
     known = names(recipe)
-    if name in known:  # a group that nothing is taken from where nobody says so
+    if name in known:  # a group that is not among the defaults
         return f"{name}: is added, with a plus: +{name}=..."
     last = {full.rpartition(".")[2]: full for full in known}
     if takers := [f"recipes/{other}.py" for other in TRAINING if recipe in TRAINING and name in names(other)]:
@@ -113,26 +113,26 @@ def no_such_setting(name: str, recipe: str) -> str:
 
 
 def no_such_choice(group: str, choice: str, choices: Sequence[str]) -> str:
-    """Say that there is no file of a name in a group."""
+    """Return a message that a group has no such choice, with those that it has."""
     return f"{group}={choice}: there are {', '.join(choices)}{settings.suggestion(choice, choices)}."
 
 
 def refuse_slips(recipe: str, arguments: Sequence[str]) -> None:
-    """Refuse what is no setting and no choice of a group, and a setting that is written as a flag."""
+    """Refuse unknown settings, unknown choices of a group, and settings written as flags."""
     for argument in arguments:
         flag, _, value = argument.partition("=")
         if flag.startswith("--") and flag not in FLAGS and not any(known.startswith(flag) for known in HYDRAS_FLAGS):
             written = f"{flag[2:].replace('-', '_')}={value or 'VALUE'}"
             raise ValueError(f"{argument}: settings are written without dashes, {written}.")
     if any(argument.startswith(("--config", "-c")) for argument in arguments):
-        return  # with configurations of one's own there may be other groups
+        return  # the user's own configurations may have other groups
     found, known = groups(recipe), set(names(recipe))
     free = tuple(f"{option.name}." for option in options(recipe) if option.free)
     for argument in arguments:
         name, equals, value = argument.partition("=")
         name = name.lstrip("+~")
         if not equals or not re.fullmatch(r"[\w.]+", name):
-            continue  # hydra's own flags and groups, or nothing that it reads
+            continue  # hydra's own flags and groups, or no override
         if not (name in known or name.startswith(("hydra.", *free)) or (CONFIG_DIR / name).is_dir()):
             raise ValueError(no_such_setting(name, recipe))
         if name in found and value.replace(" ", "").startswith("[["):  # hydra fails on it
@@ -146,14 +146,14 @@ WIDTH, COLUMN = 118, 42
 
 
 def answer_early() -> None:
-    """Print the help of the recipe that is started, if it is asked for, or say which setting is none; and leave."""
+    """Print the started recipe's help if asked for, or an error for an unknown setting, and exit; else return."""
     program = Path(sys.argv[0])
     if program.resolve().parent != FOLDER:
         return
     if {"--help", "-h"} & set(sys.argv[1:]):
         try:
             print("\n".join(usage(program.stem)), flush=True)
-        except BrokenPipeError:  # `| head` has what it wanted: what is left goes nowhere, also at exit
+        except BrokenPipeError:  # e.g. `| head`: discard the rest, also what is flushed at exit
             os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         raise SystemExit(0)
     try:
@@ -164,7 +164,7 @@ def answer_early() -> None:
 
 
 def command(recipe: str) -> str:
-    """Return the words that start a recipe from here: of a clone its file, of an installed package, that."""
+    """Return the shell command that starts a recipe, from the clone or from the installed package."""
     installed = (FOLDER.parent / "__main__.py").is_file()
     return f"{python()} -m dreamer_racing {recipe}" if installed else f"{python()} {from_here(FOLDER / recipe)}.py"
 
@@ -192,7 +192,7 @@ def usage(recipe: str) -> Iterator[str]:
 
 
 def _entry(name: str, text: str) -> Iterator[str]:
-    """Yield a name, and beside it what it means."""
+    """Yield the lines of a name with its meaning beside it."""
     lines = wrap(text, WIDTH - COLUMN) or [""]
     if len(name) + 4 > COLUMN:
         yield f"  {name}"

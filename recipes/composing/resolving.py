@@ -1,4 +1,4 @@
-"""What a configuration leaves open, filled in for this machine, and said."""
+"""Fill in the settings that a configuration leaves open, for this machine, and print the choices."""
 
 import math
 from collections.abc import Mapping
@@ -26,11 +26,11 @@ NUM_ENVS = 32  # of the recipes with a world model
 SHORT_WINDOW = 16  # records, on a CUDA device
 MODEL_OF_BUDGET = {"smoke": "debug", "paper": "paper_large"}
 NAMES = {"dreamer_v3": "DreamerV3", "latent_ppo": "latent PPO"}
-FEW_WORLDS = 4  # of fewer a world that is held out is too much to do without
+FEW_WORLDS = 4  # with fewer worlds none is held out
 
 
 def resolve_common(config: DictConfig, num_envs: int) -> torch.device:
-    """Fill in what every recipe leaves open, and say what was chosen; return the learner's device."""
+    """Fill in the settings that every recipe leaves open, print the choices, and return the learner's device."""
     device = choose_device(config.device)
     if config.device == "auto":
         print(f"device: {device} (device=auto)")
@@ -59,23 +59,23 @@ def resolve_common(config: DictConfig, num_envs: int) -> torch.device:
 
 
 def note_track(config: DictConfig) -> None:
-    """Note what a track's file says, or where a run that goes on has noted it, say whether that has changed since."""
+    """Store a track file's contents in a new run's configuration; in a resumed run, print if the file has changed."""
     if config.track_description is None:
         found: list[str | None] = []
         parallel.together(lambda: found.append(describe_file(config.track)))
         config.track_description = parallel.agreed(found[0])
         return
-    with suppress(TrackError):  # it is gone, or none any more
+    with suppress(TrackError):  # the file is gone or no longer valid
         if describe_file(config.track) != config.track_description:
             print(f"track: as {config.track} was when the run was begun, which it no longer is")
 
 
 def resolve_baseline(config: DictConfig, num_envs: Mapping[str, int]) -> DictConfig:
-    """Fill in what a baseline leaves open, by what it sees (``pixels`` or ``state``), and say what was chosen.
+    """Fill in the settings that a baseline leaves open, by its observations, and print the choices.
 
     Args:
         config: of the recipe.
-        num_envs: worlds flown side by side, of either.
+        num_envs: number of worlds, for ``pixels`` and for ``state`` observations.
     """
     resolve_common(config, num_envs["pixels" if config.env.from_pixels else "state"])
     if config.network.size == "auto":
@@ -90,7 +90,7 @@ def resolve_baseline(config: DictConfig, num_envs: Mapping[str, int]) -> DictCon
 
 
 def tune(config: DictConfig) -> str:
-    """Choose the file of the group `tuned` for what is to be trained with a world model."""
+    """Choose the configuration of the group `tuned` for a run with a world model, and print the choice."""
     device, size, budget = choose_device(config.device).type, config.model.size, config.budget
     others = {
         "env.from_pixels=false": not config.env.from_pixels,
@@ -108,7 +108,7 @@ def tune(config: DictConfig) -> str:
 
 
 def resolve_world_model(config: DictConfig) -> DictConfig:
-    """Fill in what a recipe with a world model leaves open, by device, size and budget, and say what was chosen."""
+    """Fill in the settings that a world-model recipe leaves open, by device, size and budget; print the choices."""
     device = resolve_common(config, NUM_ENVS)
     size = config.model.size
     if size == "auto":
@@ -132,7 +132,7 @@ def resolve_world_model(config: DictConfig) -> DictConfig:
             print("updates: replayed as one CUDA graph (model.cuda_graph=null)")
     tell_of_tuned(config)
     if config.replay.held_out is None:
-        worlds = config.env.num_envs // parallel.asked_for()  # of the first process, which holds them out
+        worlds = config.env.num_envs // parallel.asked_for()  # those of the first process, which holds them out
         config.replay.held_out = int(worlds >= FEW_WORLDS)
         if not config.replay.held_out:
             print(f"held out: nothing, because there are only {worlds} worlds (replay.held_out=null)")
@@ -140,7 +140,7 @@ def resolve_world_model(config: DictConfig) -> DictConfig:
 
 
 def tell_of_tuned(config: DictConfig) -> None:
-    """Say what the settings of the group `tuned` mean, and what of them was asked for otherwise."""
+    """Print what the chosen settings of the group `tuned` mean, and which of them have other values here."""
     if config.tuned not in ("auto", "none") and (CONFIG_DIR / "tuned" / f"{config.tuned}.yaml").is_file():
         files = [CONFIG_DIR / "tuned" / folder / f"{config.tuned}.yaml" for folder in ("", config.algorithm)]
         said_there = [line for file in files if file.exists() for line in head_of(file)]
@@ -155,14 +155,14 @@ def tell_of_tuned(config: DictConfig) -> None:
 
 
 def head_of(file: Path) -> list[str]:
-    """Return the lines of the comment at the head of a file, behind hydra's own, until one that is empty."""
+    """Return a file's head comment without hydra's own first line, up to the first empty comment line."""
     lines = file.read_text(encoding="utf-8").splitlines()[1:]
     return [line[2:] for line in takewhile(lambda line: line.startswith("# "), lines)]
 
 
 def changed_from_tuned(config: DictConfig) -> list[str]:
-    """Return ``setting=value (there)`` of all that the files of `tuned` set, and that is otherwise here."""
-    started = GlobalHydra.instance().is_initialized()  # as by a recipe that runs
+    """Return ``setting=value (tuned value)`` for each setting of the group `tuned` with another value here."""
+    started = GlobalHydra.instance().is_initialized()  # in a running recipe
     with nullcontext() if started else hydra.initialize_config_dir(str(CONFIG_DIR), version_base="1.3"):
         tuned = settings_of(hydra.compose(config.algorithm, [f"tuned={config.tuned}"]))
         plain = settings_of(hydra.compose(config.algorithm, ["tuned=none", f"model={tuned['model.size']}"]))
@@ -175,10 +175,10 @@ def changed_from_tuned(config: DictConfig) -> list[str]:
 
 
 def shorten_windows(config: DictConfig, device: torch.device) -> None:
-    """On a CUDA device, take the records of a batch in more and shorter windows where their number is left open.
+    """Use more and shorter windows per batch on a CUDA device, if neither their number nor their length is given.
 
-    A record of a window waits for the one before it, and every wait is a kernel's launch; windows begin warm then, or
-    the first records of short ones would teach forgetting.
+    The records of a window are processed in sequence, with kernel launches for each. Short windows begin with stored
+    latents; without, their first records would teach the model to forget.
     """
     open_numbers = all(OmegaConf.is_missing(config.model, name) for name in ("batch_size", "batch_length"))
     shortened = device.type == "cuda" and open_numbers and config.replay.context is not False
@@ -194,7 +194,7 @@ def shorten_windows(config: DictConfig, device: torch.device) -> None:
 
 
 def let_drift(config: DictConfig) -> None:
-    """Hold the policy nowhere where no latents are kept to hold it at, or where they differ by their draw already."""
+    """Turn the policy-drift loss off if the replay stores no latents, or if latents are sampled."""
     reasons = {
         "records keep no latents (replay.context=false)": not config.replay.context,
         "latents are drawn (model.sampled=true)": config.model.sampled,
@@ -205,5 +205,5 @@ def let_drift(config: DictConfig) -> None:
 
 
 def captures(config: DictConfig, device: torch.device) -> bool:
-    """Whether updates can be captured as a CUDA graph: not those that exchange something on the way."""
+    """Return whether updates can be captured as a CUDA graph: not if processes exchange data in its middle."""
     return device.type == "cuda" and (parallel.asked_for() == 1 or config.algorithm == "latent_ppo")

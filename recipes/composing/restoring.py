@@ -1,4 +1,4 @@
-"""What recipes that fly a trained policy share: the checkpoint brought back, and what is written beside its numbers."""
+"""Restore a trained policy for the recipes that fly it, and describe where their results come from."""
 
 import time
 from dataclasses import dataclass, replace
@@ -38,17 +38,17 @@ from dreamer_racing.training.schedule import Schedule
 
 @dataclass
 class FlightConfig:
-    """What recipes that fly a trained policy have in common."""
+    """Settings that the recipes which fly a trained policy share."""
 
     checkpoint: str = MISSING  # run directory, checkpoint, or agent (docs/agents.md)
-    weights: str = "auto"  # auto | averaged | trained: which to fly; auto takes the averaged where they are kept
-    episodes: int = setting(100, COUNT)  # of each condition
-    # flown side by side; null: every episode has a world of its own, so that every policy meets the same races
+    weights: str = "auto"  # auto | averaged | trained: which to fly; auto takes the averaged ones if there are any
+    episodes: int = setting(100, COUNT)  # per condition
+    # worlds that fly in parallel; null: one per episode, so that every policy flies the same races
     num_envs: int | None = setting(None, COUNT)
     track: str | None = None  # null: the track it was trained on
-    decoys: str | None = None  # +decoys=paper | none; null: as it was trained
+    decoys: str | None = None  # +decoys=paper | none; null: as in training
     preset: str | None = None  # null: the physics it was trained on
-    run_dir: str | None = None  # null: in the run of the checkpoint
+    run_dir: str | None = None  # null: the run directory of the checkpoint
     device: str = "auto"
     renderer: str = "auto"
     seed: int = setting(0, SEED)
@@ -56,31 +56,31 @@ class FlightConfig:
 
 @dataclass
 class Restored:
-    """A trained agent, and the race that it is to fly."""
+    """A trained agent, and the race that it will fly."""
 
     checkpoint: Path  # or the folder of an agent
-    trained: RunConfig  # configuration of its run, with the race asked for in place of the one trained on
-    trained_on: str  # track
+    trained: RunConfig  # configuration of its run, with the requested race in place of the training race
+    trained_on: str  # track of the training
     flyer: Evaluable
-    weights: str  # which of them fly: averaged | trained
+    weights: str  # averaged | trained
     env_steps: int
-    machine: dict[str, Any]  # versions and commit too, as they were at the start
+    machine: dict[str, Any]  # with versions and commit, as of the start
     started: float  # s, by the monotonic clock
 
     @property
     def run_dir(self) -> Path:
-        """Where to write beside the run that left the checkpoint; agents that ship are left as they are."""
+        """Directory for results: the checkpoint's run directory, or for an agent a folder below runs/."""
         return results_of(self.checkpoint)
 
     @property
     def weights_sha256(self) -> str | None:
-        """Of all that flies, as in an export's contract; None of the baselines."""
+        """SHA-256 of the weights that act, as in an export's contract; None for the baselines."""
         if isinstance(self.flyer, WorldModelLearner):
             return hash_weights(ActorStep(self.flyer.flying_agent))
         return hash_weights(ActorStep(self.flyer.agent)) if isinstance(self.flyer, ShippedAgent) else None
 
     def provenance(self, config: FlightConfig) -> dict[str, Any]:
-        """Say how the numbers of an evaluation that ends now came about."""
+        """Return the provenance of an evaluation that ends now."""
         return {
             "command": command_line(),
             "checkpoint": config.checkpoint,
@@ -105,11 +105,11 @@ class Restored:
 
 
 def restore(config: FlightConfig) -> Restored:
-    """Bring back the policy of a checkpoint, for the race that the configuration names.
+    """Restore the policy of a checkpoint, for the race that the configuration names.
 
     Raises:
-        FileNotFoundError: there is no such checkpoint or agent; the message names the agents that ship.
-        ValueError: it was not trained to race, lacks the weights asked for, or the device is not there.
+        FileNotFoundError: there is no such checkpoint or agent; the message names the included agents.
+        ValueError: it was not trained to race, lacks the requested weights, or the device is not available.
         TrackError: there is no such track, or no such decoys on it.
     """
     started, machine = time.monotonic(), provenance()
@@ -122,7 +122,7 @@ def restore(config: FlightConfig) -> Restored:
     trained_on = trained.track
     if config.track:
         trained.track, trained.track_description, trained.decoys = config.track, None, None
-    trained.track_description = trained.track_description or describe_file(trained.track)  # as it is flown
+    trained.track_description = trained.track_description or describe_file(trained.track)  # as the file is now
     trained.decoys = config.decoys or trained.decoys
     trained.env.preset = config.preset or trained.env.preset
     trained.env.renderer = config.renderer
@@ -144,16 +144,16 @@ def restore(config: FlightConfig) -> Restored:
 
 
 def find_trained(name: str) -> Path:
-    """Find what `checkpoint=` and `agent=` name: an agent that ships, by its name, or a path.
+    """Find the agent or checkpoint that `checkpoint=` or `agent=` names.
 
     Args:
-        name: of an agent that ships; or path of an agent's folder, a run directory, or a checkpoint.
+        name: of an included agent; or path of an agent's folder, a run directory, or a checkpoint.
 
     Returns:
         The folder of the agent, or the newest checkpoint there.
 
     Raises:
-        FileNotFoundError: there is neither; the message names the agents that ship.
+        FileNotFoundError: there is neither; the message names the included agents.
     """
     path = agent_path(name)
     if is_agent(path):
@@ -165,12 +165,12 @@ def find_trained(name: str) -> Path:
 
 
 def config_folder(checkpoint: Path) -> Path:
-    """Where the configuration of a checkpoint or an agent lies."""
+    """Return the folder that holds the configuration of a checkpoint or an agent."""
     return checkpoint if is_agent(checkpoint) else RunDirectory.of(checkpoint).path
 
 
 def results_of(checkpoint: Path) -> Path:
-    """Where results of a checkpoint or an agent go."""
+    """Return the folder for results of a checkpoint or an agent."""
     return Path("runs") / f"agent_{checkpoint.name}" if is_agent(checkpoint) else RunDirectory.of(checkpoint).path
 
 
@@ -184,12 +184,12 @@ def heading(title: str, provenance: dict[str, Any]) -> str:
 def restore_learner(
     config: RunConfig, checkpoint: Path, device: torch.device, weights: str = "auto"
 ) -> tuple[Learner, dict[str, int]]:
-    """Bring back the learner of a checkpoint of a run, and the run's counters.
+    """Restore the learner of a run's checkpoint, and the run's counters.
 
     Raises:
-        ValueError: the checkpoint does not have the weights asked for.
+        ValueError: the checkpoint does not have the requested weights.
     """
-    config.env.device = "cpu"  # wherever it was trained
+    config.env.device = "cpu"  # whatever it was trained on
     chosen = choose_weights(weights, kept_weights(load_state(checkpoint, "learner")[0]), checkpoint)
     if isinstance(config, WorldModelRunConfig):
         config.model.cuda_graph = False
@@ -203,9 +203,9 @@ def restore_learner(
     if not isinstance(config, WorldModelRunConfig):
         load_components(checkpoint, parts, map_location=device)
         return learner, counters
-    schedule = Schedule(config.schedule, config.scheduled, config.total_env_steps)  # takes its gates
+    schedule = Schedule(config.schedule, config.scheduled, config.total_env_steps)  # its gates come from the checkpoint
     load_components(checkpoint, {**parts, "schedule": schedule}, map_location=device)
-    # The networks bring theirs, which do not change if the run is made longer.
+    # Saved with the networks; the schedule of a run that was made longer would give other values.
     left_out = ("min_std", "max_std", "start_on_line")
     numbers = {name: value for name, value in schedule.at(counters["env_steps"]).items() if name not in left_out}
     cast(WorldModelLearner, learner).adjust(**numbers)
@@ -213,7 +213,7 @@ def restore_learner(
 
 
 def restore_shipped(config: RunConfig, folder: Path, device: torch.device) -> ShippedAgent:
-    """Bring back an agent that ships, for the environment of its configuration.
+    """Load an exported agent, for the environment of its configuration.
 
     Raises:
         FileNotFoundError: a file of it is missing.
@@ -228,5 +228,5 @@ def restore_shipped(config: RunConfig, folder: Path, device: torch.device) -> Sh
 
 
 def _probe(config: RunConfig) -> Environment:
-    """Make a single world, to look at what an agent sees in it."""
-    return make_env(replace(config, env=replace(config.env, start_on_line=0.0)), num_envs=1)  # a line takes seconds
+    """Make an environment with one world, to read its specs."""
+    return make_env(replace(config, env=replace(config.env, start_on_line=0.0)), num_envs=1)  # planning a line is slow

@@ -1,4 +1,4 @@
-"""Configurations of runs, read back: typed as this version knows them, and compared."""
+"""Read, check and compare the saved configurations of runs."""
 
 from collections.abc import Collection
 from pathlib import Path
@@ -21,23 +21,23 @@ OF_THIS_MACHINE = (
     "resume",
     "run_dir",
 )
-"""What a run that is resumed chooses anew, unless it was begun with a choice."""
+"""Settings that a resumed run chooses anew, unless they were given when it began."""
 SEEN = ("env.control_rate", "env.camera_rate", "env.camera_tilt", "env.imu", "env.vector")
-"""What an agent sees, and how often: other networks would learn from it."""
+"""Settings that define an agent's observations and their rate; its networks fit no others."""
 
 Config = TypeVar("Config", DictConfig, ListConfig)
 
 
 def trained_config(run_dir: Path) -> RunConfig:
-    """Read back the configuration that a run was trained with, as `saved_config` does."""
+    """Return the configuration that a run was trained with as an object; see `saved_config`."""
     return cast(RunConfig, OmegaConf.to_object(saved_config(run_dir)))
 
 
 def saved_config(run_dir: Path) -> DictConfig:
-    """Read back what a run was last trained with, resolved; what it does not say is at its default.
+    """Read the resolved configuration that a run was last trained with; settings that it lacks get their defaults.
 
     Raises:
-        ValueError: it is damaged, of an unknown algorithm, or has a setting that this version does not.
+        ValueError: it is damaged, of an unknown algorithm, or has a setting that this version does not have.
     """
     path = RunDirectory(run_dir).config
     saved = read_yaml(path, DictConfig)
@@ -54,11 +54,11 @@ def saved_config(run_dir: Path) -> DictConfig:
 
 
 def read_yaml(path: Path, kind: type[Config]) -> Config:
-    """Read a file that a run left.
+    """Read a YAML file that a run wrote.
 
     Raises:
-        ValueError: it is damaged, is not that at all, or refers to what lies outside of it, as a run never writes and a
-            stranger might: ``${oc.env:NAME}`` would read this machine's environment.
+        ValueError: it is damaged, of another kind, or contains interpolations. A run writes none, but in a file from a
+            stranger ``${oc.env:NAME}`` would read this machine's environment.
     """
     try:
         content = OmegaConf.load(path)
@@ -75,14 +75,14 @@ def read_yaml(path: Path, kind: type[Config]) -> Config:
 
 
 def keep_saved(config: DictConfig, saved: DictConfig, given: Collection[str]) -> None:
-    """Set everything in a composed configuration to what was saved, but for `OF_THIS_MACHINE` and what is given now.
+    """Set a composed configuration to the saved values, except `OF_THIS_MACHINE` and settings that are given now.
 
-    So a run goes on as it was trained, whatever the defaults of a later version.
+    So a resumed run keeps its settings, even if a later version has other defaults.
 
     Args:
-        config: of the run that goes on, which is changed.
-        saved: of the run as it was.
-        given: names of settings and groups; `tuned` and `budget` are everything.
+        config: of the resumed run; changed in place.
+        saved: of the run so far.
+        given: names of settings and groups; with `tuned` or `budget` no saved value is kept.
     """
     if {"tuned", "budget"}.isdisjoint(given):
         for name, value in flatten(cast(dict[str, Any], OmegaConf.to_container(saved))):
@@ -92,17 +92,17 @@ def keep_saved(config: DictConfig, saved: DictConfig, given: Collection[str]) ->
 
 
 def settings_of(config: DictConfig) -> dict[str, Any]:
-    """Return all settings by their dotted names, with values as files have them."""
+    """Return all settings by their dotted names, with values as in YAML files."""
     return dict(flatten(cast(dict[str, Any], OmegaConf.to_container(config, enum_to_str=True))))
 
 
 def said(value: Any) -> str:
-    """Write a value of `settings_of` as the command line takes it."""
+    """Return a value of `settings_of` as it is written on the command line."""
     return "null" if value is None else str(value).lower() if isinstance(value, bool) else str(value)
 
 
 def changed_settings(config: DictConfig) -> list[str]:
-    """Every setting in which a resumed run goes on differently: by an override, this machine, or another version."""
+    """Return the settings that a resumed run has changed: by an override, this machine, or another version."""
     before = settings_of(saved_config(Path(config.run_dir)))
     return [
         f"{name}={said(value)} (was {said(before.get(name))})"

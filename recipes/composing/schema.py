@@ -36,23 +36,22 @@ from dreamer_racing.training.schedule import (
 
 @dataclass
 class ModelConfig(LearnerConfig):
-    """Size of the networks and the numbers that go with it: `auto` chooses by device, what is missing by size."""
+    """Size of the networks and its numbers: `size=auto` chooses by device; missing numbers come from the size."""
 
     size: str = MISSING
-    sampled: bool = True  # states are samples of their categoricals, as in DreamerV3; false: the probabilities
-    state_std: bool = True  # the actions' deviation depends on the state, as in DreamerV3; false: one number each
+    sampled: bool = True  # latent states are sampled, as in DreamerV3; false: they are the probabilities
+    state_std: bool = True  # the actions' deviation depends on the state, as in DreamerV3; false: one number per action
     batch_size: int = setting(MISSING, COUNT)  # windows in a batch
     batch_length: int = setting(MISSING, Range(2))  # records in a window
     replay_ratio: float = setting(MISSING, POSITIVE)  # records trained on per environment step
     imagination_horizon: int = setting(MISSING, COUNT)
-    # Those of an update that the size decides:
     imagination_starts: int | None = setting(MISSING, COUNT)
     learning_rate: float = setting(MISSING, POSITIVE)
     warmup_updates: int = setting(MISSING, NOT_NEGATIVE)
 
 
 class CollectorKind(Enum):
-    """Who flies to learn, and when."""
+    """What collects rollouts: this process between updates, or workers on a Ray cluster."""
 
     local = "local"
     ray = "ray"
@@ -60,15 +59,15 @@ class CollectorKind(Enum):
 
 @dataclass
 class RunConfig:
-    """What all training recipes have in common."""
+    """Settings that all training recipes share."""
 
-    algorithm: str = MISSING  # the recipe
+    algorithm: str = MISSING  # name of the recipe
     track: str = "kidney"  # name of a built-in track, or path to a YAML file
-    # not to be given: what a track's file said when the run was begun, as JSON; the run and what comes of it fly that
+    # set by the recipe: a track file's contents as JSON when the run began, which the run and its evaluations use
     track_description: str | None = None
-    decoys: str | None = None  # +decoys=paper: gates that are only drawn, on tracks that have a place for them
+    decoys: str | None = None  # +decoys=paper: gates that are only drawn, on tracks that define places for them
     task: str = "walker_walk"  # with env=dmc: domain_task of the Control Suite
-    budget: str = "none"  # none | smoke | cpu | paper: how long a run is, and what goes with it
+    budget: str = "none"  # none | smoke | cpu | paper: length of the run, and settings that depend on it
     total_env_steps: int = setting(1_000_000, COUNT)  # control steps summed over environments
     rollout_steps: int = setting(MISSING, COUNT)  # control steps of every environment between updates
     seed: int = setting(0, SEED)
@@ -90,18 +89,18 @@ class RunConfig:
 
     @property
     def run_directory(self) -> RunDirectory:
-        """Where everything of the run lands, once that is chosen."""
+        """The run's directory, once `resolve_common` has chosen it."""
         assert self.run_dir is not None, "resolve_common() names it"
         return RunDirectory(Path(self.run_dir))
 
     def track_as_begun(self) -> Track:
-        """Return the track: of a file as it was when the run was begun, whatever became of that."""
+        """Return the track; that of a file is as it was when the run began, even if the file has changed."""
         noted = self.track_description
         track = self.track if noted is None else read_track(json.loads(noted), f"track_description of {self.track}")
         return with_decoys(track, self.decoys)
 
     def check(self) -> None:
-        """Refuse settings with which the run could not work, once nothing is left open.
+        """Refuse settings with which a resolved run could not work.
 
         Raises:
             ValueError: the message names the setting as it is written, its value, and what would be right.
@@ -117,7 +116,7 @@ class RunConfig:
         self.check_worlds()
 
     def check_worlds(self) -> None:
-        """Refuse worlds that cannot be, races that leave each other no room to start, and noise of starts elsewhere."""
+        """Refuse an invalid environment, starts or start noise that the track forbids, and noise outside races."""
         env, noise = self.env, self.evaluation.start_noise
         env.check()
         if not is_race(self):
@@ -141,19 +140,19 @@ class RunConfig:
 
 @dataclass
 class ReplayRunConfig(RunConfig):
-    """What training recipes with a replay have in common besides."""
+    """Settings that training recipes with a replay buffer share."""
 
     prefill: int = setting(MISSING, NOT_NEGATIVE)  # env_steps collected before the first update
     replay: ReplayConfig = field(default_factory=ReplayConfig)
 
-    ratio_group: ClassVar[str] = "model"  # of settings, that has replay_ratio
+    ratio_group: ClassVar[str] = "model"  # group of settings that has replay_ratio
 
     def make_replay_ratio(self) -> ReplayRatio:
-        """Make what says how much the run trains."""
+        """Make the replay ratio, which counts the updates that are due."""
         raise NotImplementedError(f"{type(self).__name__} must say how much its run trains.")
 
     def check(self) -> None:
-        """As `RunConfig.check`; and refuse settings with which there would be no update."""
+        """Check as `RunConfig.check`, and refuse settings with which there would be no update."""
         super().check()
         if self.total_env_steps <= self.prefill:
             raise ValueError(
@@ -171,17 +170,17 @@ class ReplayRunConfig(RunConfig):
 
 @dataclass
 class WorldModelRunConfig(ReplayRunConfig):
-    """What the recipes with a world model have in common."""
+    """Settings that the recipes with a world model share."""
 
-    # run, checkpoint or agent (docs/agents.md) whose weights a new run begins with, on whatever track and physics
+    # run, checkpoint or agent (docs/agents.md) whose weights a new run begins with; track and physics may differ
     init_from: str | None = None
-    # none: the algorithm as published; race: what races on a CPU; images: the same, but no network sees the simulator's
-    # state in training; gpu: race for a GPU, unmeasured; suite: what learns the Control Suite on a CPU; auto: race or
-    # suite from images on a CPU by cpu_small, else none
+    # none: the algorithm as published; race: for racing on a CPU; images: race, but no network sees the simulator's
+    # state in training; gpu: race for a GPU, unmeasured; suite: for the Control Suite on a CPU; auto: race or suite,
+    # but none with env.from_pixels=false, budget=smoke or paper, or another model than cpu_small
     tuned: str = "auto"
     prefill: int = setting(4_000, NOT_NEGATIVE)
     rollout_steps: int = setting(8, COUNT)
-    # local: fly in turns with updates; ray: workers on a Ray cluster fly, also during updates
+    # local: collection and updates alternate; ray: workers on a Ray cluster collect, also during updates
     collector: CollectorKind = CollectorKind.local
     num_workers: int | None = setting(None, COUNT)  # with collector=ray; null: 2
     workers: WorkersConfig = field(default_factory=WorkersConfig)
@@ -194,33 +193,33 @@ class WorldModelRunConfig(ReplayRunConfig):
 
     @property
     def moves_start_on_line(self) -> bool:
-        """As of any run."""
+        """Whether the schedule moves the share of episodes that begin on a line."""
         return self.schedule.start_on_line.to is not None
 
     def make_replay_ratio(self) -> ReplayRatio:
-        """Make what says how much the run trains."""
+        """Make the replay ratio, which counts the updates that are due."""
         model = self.model
         return ReplayRatio(model.replay_ratio, model.batch_size * model.batch_length, self.prefill)
 
     @property
     def scheduled(self) -> dict[str, Any]:
-        """Whose settings the schedule moves, by their names."""
+        """Configurations whose settings the schedule changes, by their dotted names."""
         return {"loss": self.loss, "env": self.env, "model": self.model}
 
     @property
     def weight_interval(self) -> int:
-        """How many env_steps old the weights of workers are at most."""
+        """Largest age of the workers' weights, in env_steps."""
         return self.workers.weight_interval or 2 * self.env.num_envs * self.rollout_steps
 
     def check(self) -> None:
-        """As `ReplayRunConfig.check`; and refuse schedules, networks and workers that cannot be."""
+        """Check as `ReplayRunConfig.check`, and refuse invalid schedules, networks and workers."""
         super().check()
         self.schedule.check(self.scheduled, self.env.suite)
         self.check_windows()
         self.check_collector()
 
     def check_windows(self) -> None:
-        """Refuse images that networks of that size cannot halve, and windows longer than what is collected before."""
+        """Refuse image sizes that the CNN cannot divide, and windows longer than a world's prefill."""
         env, size = self.env, get_size(self.model.size)
         try:
             smallest_map(env.image_size, size.cnn_patch, len(size.cnn_multipliers))
@@ -240,7 +239,7 @@ class WorldModelRunConfig(ReplayRunConfig):
             )
 
     def check_collector(self) -> None:
-        """Refuse workers beside other ways to collect, and worlds or weights that cannot be shared out among them."""
+        """Refuse worker settings without collector=ray, several learners with it, and unequal shares of the worlds."""
         workers, num_envs, asked = self.num_workers, self.env.num_envs, self.workers
         if self.collector is not CollectorKind.ray:
             default = vars(WorkersConfig())
@@ -266,14 +265,14 @@ class WorldModelRunConfig(ReplayRunConfig):
 
 @dataclass
 class DreamerV3RunConfig(WorldModelRunConfig):
-    """`recipes/dreamer_v3.py`."""
+    """Configuration of `recipes/dreamer_v3.py`."""
 
     algorithm: str = "dreamer_v3"
     loss: DreamerV3Losses = field(default_factory=DreamerV3Losses)
     schedule: DreamerV3ScheduleConfig = field(default_factory=DreamerV3ScheduleConfig)
 
     def check(self) -> None:
-        """As `WorldModelRunConfig.check`; and refuse objectives of collected steps, and losses beyond a window."""
+        """Check as `WorldModelRunConfig.check`, and refuse objectives of collected steps and losses beyond a window."""
         super().check()
         find_objective(self.loss.actor, collected=False)
         steps, length = self.loss.open_loop_steps, self.model.batch_length
@@ -285,7 +284,7 @@ class DreamerV3RunConfig(WorldModelRunConfig):
 
 @dataclass
 class LatentPPORunConfig(WorldModelRunConfig):
-    """`recipes/latent_ppo.py`."""
+    """Configuration of `recipes/latent_ppo.py`."""
 
     algorithm: str = "latent_ppo"
     loss: LatentPPOLosses = field(default_factory=LatentPPOLosses)
@@ -293,18 +292,18 @@ class LatentPPORunConfig(WorldModelRunConfig):
 
     @property
     def scheduled(self) -> dict[str, Any]:
-        """Whose settings the schedule moves, by their names."""
+        """Configurations whose settings the schedule changes, by their dotted names."""
         return super().scheduled | {"loss.ppo": self.loss.ppo}
 
     def check(self) -> None:
-        """As `WorldModelRunConfig.check`; and refuse objectives of imagined steps."""
+        """Check as `WorldModelRunConfig.check`, and refuse objectives of imagined steps."""
         super().check()
         find_objective(self.loss.actor, collected=True)
 
 
 @dataclass
 class NetworkConfig:
-    """Hidden layers of the baselines' actor and critic: `auto` chooses by what they see."""
+    """Hidden layers of the baselines' actor and critic: `size=auto` chooses by the observations."""
 
     size: str = MISSING  # auto | paper | small
     layers: int = setting(MISSING, NOT_NEGATIVE)
@@ -313,7 +312,7 @@ class NetworkConfig:
 
 @dataclass
 class PPORunConfig(RunConfig):
-    """`recipes/ppo.py`."""
+    """Configuration of `recipes/ppo.py`."""
 
     algorithm: str = "ppo"
     rollout_steps: int = setting(32, COUNT)
@@ -321,7 +320,7 @@ class PPORunConfig(RunConfig):
     ppo: PPOConfig = field(default_factory=PPOConfig)
 
     def check(self) -> None:
-        """As `RunConfig.check`; and refuse more minibatches than a rollout has records."""
+        """Check as `RunConfig.check`, and refuse more minibatches than a rollout has records."""
         super().check()
         records = self.env.num_envs * self.rollout_steps
         if self.ppo.minibatches > records:
@@ -334,7 +333,7 @@ class PPORunConfig(RunConfig):
 
 @dataclass
 class SACRunConfig(ReplayRunConfig):
-    """`recipes/sac.py`."""
+    """Configuration of `recipes/sac.py`."""
 
     algorithm: str = "sac"
     prefill: int = setting(10_000, NOT_NEGATIVE)
@@ -345,18 +344,18 @@ class SACRunConfig(ReplayRunConfig):
     ratio_group: ClassVar[str] = "sac"
 
     def make_replay_ratio(self) -> ReplayRatio:
-        """Make what says how much the run trains."""
+        """Make the replay ratio, which counts the updates that are due."""
         return ReplayRatio(self.sac.replay_ratio, self.sac.batch_size, self.prefill)
 
 
 RECIPES: dict[str, type[RunConfig]] = {
     schema.algorithm: schema for schema in (DreamerV3RunConfig, LatentPPORunConfig, PPORunConfig, SACRunConfig)
 }
-"""The training recipes by algorithm, which is the name of its file in recipes/ and in recipes/config/."""
+"""Configuration classes by algorithm, which is also the name of its file in recipes/ and recipes/config/."""
 
 
 def is_race(config: RunConfig) -> bool:
-    """Return whether the run races drones, rather than being tested on the Control Suite."""
+    """Return whether the run trains on drone races, rather than on the Control Suite."""
     return config.env.suite == "race"
 
 

@@ -1,4 +1,4 @@
-"""Who flies to learn: the share of each process that torchrun started, in turns with learning, or on Ray."""
+"""Divide a run among the processes that torchrun started, or its collection among workers on a Ray cluster."""
 
 from __future__ import annotations
 
@@ -24,18 +24,18 @@ from dreamer_racing.modules import DreamerPolicy, Interface
 
 DIVIDED = ("env.num_envs", "model.batch_size", "model.imagination_starts")
 OF_PPO = ("loss.ppo.steps", "loss.ppo.minibatch")
-"""What is divided among the processes, and must be divisible; the latter of actors that learn on-policy."""
+"""Settings that are divided equally among the processes; `OF_PPO` in latent PPO only."""
 ROUNDED_DOWN = ("replay.capacity", "replay.recent_records")
-"""What is divided too, by worlds anyway."""
+"""Settings that are divided too, but may leave a remainder."""
 SEEDS_APART = 1_000_000
-"""Between the seeds of two processes' worlds, samples and actions; initial weights have that of the run."""
+"""Difference between the seeds of two processes; initial weights have the run's seed in all of them."""
 
 
 def share_of(config: WorldModelRunConfig) -> WorldModelRunConfig:
-    """What this process does of a run that is resolved and checked; of a single process, all of it.
+    """Return this process's share of a resolved and checked configuration; a single process has all of it.
 
     Raises:
-        ValueError: what is to be shared does not divide, or the devices do not suffice.
+        ValueError: a setting cannot be divided equally, or there are too few devices.
     """
     processes = parallel.count()
     if processes == 1:
@@ -74,7 +74,7 @@ def share_of(config: WorldModelRunConfig) -> WorldModelRunConfig:
 
 
 def check_devices(config: WorldModelRunConfig) -> None:
-    """Refuse more processes than CUDA devices on this machine, and to have them all on one."""
+    """Refuse more processes than this machine has CUDA devices, and the same device for all of them."""
     here, there = parallel.count_here(), torch.cuda.device_count()
     for name, device in (("device", config.device), ("env.device", config.env.device)):
         if not device.startswith("cuda"):
@@ -92,17 +92,17 @@ def check_devices(config: WorldModelRunConfig) -> None:
 
 
 def _own_device(device: str) -> str:
-    """The device of this process, of a kind."""
+    """Return this process's own device of the given type."""
     return f"cuda:{os.environ['LOCAL_RANK']}" if device.startswith("cuda") else device
 
 
 NUM_WORKERS = 2
 OF_RACES = ("body_rate_weight", "worlds.start_on_line")
-"""What a run changes in its race on the way, by the curriculum and by a schedule."""
+"""Attributes of a race's environment that the curriculum and a schedule change during the run."""
 
 
 def resolve_workers(config: DictConfig) -> None:
-    """Say how many workers there are, where that is left open; a run that goes on without any needs no number."""
+    """Fill in the number of workers; a run that is resumed without workers loses their settings, which is printed."""
     if config.collector is CollectorKind.ray:
         config.num_workers = NUM_WORKERS if config.num_workers is None else config.num_workers
     elif config.resume:
@@ -115,15 +115,15 @@ def resolve_workers(config: DictConfig) -> None:
 
 
 def make_own_env(config: WorldModelRunConfig) -> Environment:
-    """Make the environment of this process: its worlds to train in, or where workers fly, one to take their measure."""
+    """Make this process's environment: its worlds, or if workers collect, a single one that the learner is made for."""
     return make_env(config, num_envs=1 if config.collector is CollectorKind.ray else None)
 
 
 def make_rollouts(config: WorldModelRunConfig, env: Environment, learner: WorldModelLearner) -> Rollouts:
-    """Make what is collected.
+    """Make the source of rollouts: a collector in this process, or workers.
 
     Raises:
-        ValueError: workers cannot be had; the message says what was found.
+        ValueError: workers cannot be started; the message says what was found.
     """
     policy = learner.policy()
     if config.collector is CollectorKind.ray:
@@ -165,14 +165,14 @@ def make_workers(config: WorldModelRunConfig, env: Environment, policy: DreamerP
 
 
 def share_of_worker(config: WorldModelRunConfig) -> WorldModelRunConfig:
-    """What one worker has of a run."""
+    """Return the configuration of one worker."""
     own = copy.deepcopy(config)
     own.env.num_envs = config.env.num_envs // cast(int, config.num_workers)
-    own.device = "cpu"  # where its policy comes from; the collector takes it to the worker's device
+    own.device = "cpu"  # where its policy is made; the collector moves it to the worker's device
     own.env.device = worlds_device(torch.device("cuda" if config.workers.gpus else "cpu"), config.env)
     return own
 
 
 def make_worker_env(config: WorldModelRunConfig, primer: TensorDictPrimer) -> TransformedEnv:
-    """Make a worker's worlds, there."""
+    """Make a worker's environment, in the worker's process."""
     return with_memory(make_env(config, num_threads=max(1, int(config.workers.cpus))), primer)

@@ -1,8 +1,8 @@
-"""Physical and control parameters of the quadrotor, as plain numbers: no torch in here.
+"""Physical and control parameters of the quadrotor, as plain numbers without torch.
 
 Sources of numbers: [paper] Romero et al., "Dream to Fly"; [rpg] public code of the same laboratory; [choice] this
-project's, because nobody published it; [rec] the drone of the recording of a Betaflight that `drone.betaflight` is held
-against.
+project's choice, as none is published; [rec] the drone in the Betaflight recording with which `drone.betaflight` is
+compared.
 """
 
 import math
@@ -26,9 +26,9 @@ from dreamer_racing.settings import (
 
 GRAVITY = 9.81  # m/s²
 INTEGRATORS = ("Euler", "RK4")
-"""MuJoCo's names of those to choose from: `RigidStep` brings Euler's pose to second order, and RK4 needs nothing."""
+"""MuJoCo's names of the allowed integrators: `RigidStep` corrects Euler to second order; RK4 needs no correction."""
 MOTOR_LAGS = ("speed", "thrust")
-"""What may follow its target at first order: a rotor's speed, or its thrust, which goes with the square."""
+"""Quantity with first-order lag to its target: a rotor's speed, or its thrust, which is the square of the speed."""
 
 
 @dataclass(frozen=True)
@@ -36,17 +36,17 @@ class Randomisation:
     """Half-widths of the uniform, per-episode randomisation of each drone, relative unless a unit is given [rpg]."""
 
     mass: float = 0.05
-    inertia: float = 0.10  # each axis on its own
+    inertia: float = 0.10  # each axis independently
     drag: float = 0.10
     thrust: float = 0.10  # all four rotors together: battery voltage
     torque: float = 0.01
     delay_max: float = setting(0.040, NOT_NEGATIVE)  # s; the command delay is uniform in [delay_min, delay_max]
     delay_min: float = setting(0.0, NOT_NEGATIVE)  # s
-    # of drones with a Betaflight
-    gains: float = 0.0  # P, I and D of each axis on its own
-    filters: float = 0.0  # cut-offs of the gyro, and those of D
+    # only for drones with a Betaflight controller
+    gains: float = 0.0  # P, I and D of each axis independently
+    filters: float = 0.0  # cut-offs of the gyro filters, and of the D-term filters
     motor_lag: float = 0.0
-    sag_max: float = 0.0  # share of thrust that the battery loses at full load, uniform in [0, sag_max]
+    sag_max: float = 0.0  # share of thrust lost to battery sag at full load, uniform in [0, sag_max]
 
     def __post_init__(self) -> None:
         widths = {f"Randomisation: {name}": width for name, width in vars(self).items()}
@@ -64,7 +64,7 @@ class QuadrotorParameters:
     """Physical and control parameters of the drone, in SI units.
 
     Raises:
-        ValueError: the message gives the number, and what is allowed.
+        ValueError: the message gives the value, and what is allowed.
 
     Example:
         >>> QuadrotorParameters().hover_action
@@ -76,17 +76,17 @@ class QuadrotorParameters:
     arm_length: float = setting(0.14, POSITIVE)  # m, centre to rotor [paper]; X layout [choice]
     torque_constant: float = setting(0.022, POSITIVE)  # m: N m of yaw torque per N of rotor thrust [paper]
     rotor_thrust_max: float = setting(4.0, POSITIVE)  # N, thrust-to-weight ratio 2.72 [paper]
-    motor_time_constant: float = 0.033  # s, first order on rotor speed [rpg]; inf: speeds stay
-    motor_lag_of: str = "speed"  # out of `MOTOR_LAGS`
+    motor_time_constant: float = 0.033  # s, first-order lag [rpg]; inf: constant speeds
+    motor_lag_of: str = "speed"  # one of `MOTOR_LAGS`
     drag: tuple[float, float, float] = (0.0, 0.0, 0.0)  # N/(m/s), linear rotor drag in the body frame
     body_rate_max: tuple[float, float, float] = (10.0, 10.0, 4.0)  # rad/s at action ±1 [rpg]
     collective_thrust_scale: float = setting(13.33, POSITIVE)  # m/s²: c = scale · (1 + a) [rpg]
     rate_gain: float = setting(15.0, POSITIVE)  # 1/s, proportional body-rate loop [choice]
-    betaflight: BetaflightParameters | None = None  # instead of the proportional loop and its mixer
+    betaflight: BetaflightParameters | None = None  # replaces the proportional loop and its mixer
     command_delay: float = setting(0.0, NOT_NEGATIVE)  # s
     physics_dt: float = setting(0.002, POSITIVE)  # s [rpg]
     control_dt: float = setting(0.02, POSITIVE)  # s, 50 Hz [rpg]
-    integrator: str = "Euler"  # out of `INTEGRATORS`
+    integrator: str = "Euler"  # one of `INTEGRATORS`
     randomisation: Randomisation | None = None
 
     def __post_init__(self) -> None:
@@ -146,8 +146,8 @@ PRESETS: dict[str, QuadrotorParameters] = {
         motor_time_constant=0.030,  # [rec]
         motor_lag_of="thrust",  # [rec]
         betaflight=BetaflightParameters(),
-        command_delay=0.010,  # [rec]: from a channel to what acts on it
-        physics_dt=0.001,  # [rec]: of the firmware's loop
+        command_delay=0.010,  # [rec]: from the RC channel to the controller
+        physics_dt=0.001,  # [rec]: the firmware's loop period
         randomisation=Randomisation(
             gains=0.2,
             filters=0.2,
@@ -161,10 +161,10 @@ PRESETS: dict[str, QuadrotorParameters] = {
 
 
 def load_preset(preset: str | QuadrotorParameters) -> QuadrotorParameters:
-    """Return the parameters of a named preset (`easy`, `faithful`, `betaflight`), of a drone's file, or those given.
+    """Return the parameters of a named preset (`easy`, `faithful`, `betaflight`), a drone file, or those given.
 
     Raises:
-        ValueError: unknown name, or a file that is no drone.
+        ValueError: unknown name, or an invalid drone file.
     """
     if isinstance(preset, QuadrotorParameters):
         return preset
@@ -177,7 +177,7 @@ def load_preset(preset: str | QuadrotorParameters) -> QuadrotorParameters:
 
 
 def _read_drone(path: Path) -> QuadrotorParameters:
-    """Read the drone of a file, see `variations`."""
+    """Read a drone file; see `variations`."""
     base, changes = read_variation(path)
     if base not in PRESETS:
         there = ", ".join(sorted(PRESETS))
@@ -189,30 +189,30 @@ def _read_drone(path: Path) -> QuadrotorParameters:
 
 
 def save_drone(path: Path, drone: QuadrotorParameters, about: Mapping[str, Any]) -> None:
-    """Write a drone as a file that `load_preset` reads: what of it differs from the preset of its kind.
+    """Write a drone to a file that `load_preset` reads, as differences from the preset `faithful` or `betaflight`.
 
     Args:
-        path: The file, which ends in .yaml; one that is there is replaced.
-        drone: The drone; its randomisation is that of the preset.
-        about: Where its numbers come from, plain values.
+        path: The .yaml file; an existing one is replaced.
+        drone: The drone; its randomisation is not written.
+        about: Sources of its numbers, plain values.
     """
     base = "faithful" if drone.betaflight is None else "betaflight"
     write_variation(path, base, differing(PRESETS[base], drone), about)
 
 
 MIN_CONTROL_RATE = 10.0
-"""Hz: the lowest rate of actions; at 18 m/s a drone flies 1.8 m in a step then [choice]."""
+"""Lowest control rate, Hz, at which a drone at 18 m/s flies 1.8 m per step [choice]."""
 
 
 def at_control_rate(parameters: QuadrotorParameters, rate: float) -> QuadrotorParameters:
-    """The same drone with so many actions a second.
+    """Return the same drone at another control rate.
 
     Args:
-        parameters: of the drone.
+        parameters: the drone.
         rate: Hz, at least ``MIN_CONTROL_RATE``; a control step must be a whole number of physics steps.
 
     Raises:
-        ValueError: it is not, or the rate is lower.
+        ValueError: it is not, or the rate is too low.
     """
     if not rate >= MIN_CONTROL_RATE:
         raise ValueError(
@@ -228,5 +228,5 @@ def at_control_rate(parameters: QuadrotorParameters, rate: float) -> QuadrotorPa
 
 
 def without_randomisation(parameters: QuadrotorParameters) -> QuadrotorParameters:
-    """The same drone with nominal parameters in every episode (drag and delay stay)."""
+    """Return the same drone with nominal parameters in every episode (drag and delay stay)."""
     return replace(parameters, randomisation=None)

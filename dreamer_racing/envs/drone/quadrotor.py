@@ -1,9 +1,9 @@
 """The quadrotor: from collective thrust and body rates (CTBR) to the wrench on the body, for N drones at once.
 
-A `Quadrotor` holds what the flight controller and the motors remember between physics steps (rotor speeds, delayed
-commands) and each drone's randomised parameters, in tensors that stay in place, so that a CUDA graph can advance them.
-The rigid body itself is integrated by MuJoCo: once per physics step the simulator asks `Quadrotor.wrench` for the
-body-frame force and torque and applies it.
+A `Quadrotor` holds the state of the flight controller and the motors (rotor speeds, delayed commands) and each drone's
+randomised parameters, in tensors that are updated in place, so that a CUDA graph can advance them. The rigid body
+itself is integrated by MuJoCo: once per physics step the simulator calls `Quadrotor.wrench` for the body-frame force
+and torque and applies it.
 
 Shapes: N drones. SI units, body frame FLU. Its numbers and their sources: `envs.drone.parameters`.
 """
@@ -20,12 +20,12 @@ from dreamer_racing.envs.drone.parameters import GRAVITY, ROTOR_SPINS, Quadrotor
 from dreamer_racing.envs.drone.rate_loop import Own, RateLoop
 from dreamer_racing.envs.drone.rotation import rotate_inverse
 
-RELATIVE = ("mass", "inertia", "drag", "thrust", "torque")  # what is randomised as a factor of the nominal value
+RELATIVE = ("mass", "inertia", "drag", "thrust", "torque")  # parameters that are randomised by a factor
 
 
 @dataclass
 class _Drones:
-    """Per-drone parameters relative to nominal (N, ·); only kept when they are randomised."""
+    """Per-drone parameters relative to nominal (N, ·); only kept if they are randomised or commands are delayed."""
 
     mass: Tensor  # (N, 1)
     inertia: Tensor  # (N, 3)
@@ -36,19 +36,19 @@ class _Drones:
 
 
 class Quadrotor:
-    """N drones' flight controllers and motors.
+    """Flight controllers and motors of N drones.
 
     Args:
         parameters: the drone.
         num_drones: N.
-        device: where the tensors live.
+        device: device of the tensors.
         dtype: floating-point type; MuJoCo's own (float64) on CPU.
         generator: source of the per-episode randomisation, on `device`; needed only if parameters are randomised.
 
     Attributes:
-        effort: (N, 3) of the control step so far: share of its physics steps in which a rotor was to be at a limit,
-            collective thrust asked for, and what of it rotors were not to give for the sake of rates or by their
-            limits, both in N on average.
+        effort: (N, 3) of the control step so far: share of its physics steps with a rotor target at a limit, mean
+            commanded collective thrust in N, and mean shortfall in N of the rotor targets, which the mixer reduces in
+            favour of body rates or at the rotors' limits.
 
     Example:
         >>> quadrotor = Quadrotor(QuadrotorParameters(), num_drones=2)
@@ -80,7 +80,7 @@ class Quadrotor:
         self._drag = tensor(p.drag)  # (3,)
         self._gravity = tensor((0.0, 0.0, -GRAVITY)).expand(num_drones, 3)  # m/s², world frame
         self._has_drag = any(p.drag)
-        # a = -1 … 1 → (total thrust N, body rates rad/s), affine
+        # affine map from actions in [-1, 1] to total thrust, N, and body rates, rad/s
         thrust_scale = p.collective_thrust_scale * p.mass
         self._setpoint_scale = tensor((thrust_scale, *p.body_rate_max))  # (4,)
         self._setpoint_offset = tensor((thrust_scale, 0.0, 0.0, 0.0))  # (4,)
@@ -88,7 +88,7 @@ class Quadrotor:
         rows = zip(p.rotor_positions, ROTOR_SPINS, strict=True)
         self._effectiveness = tensor([[0, 0, 1, y, -x, s * p.torque_constant] for (x, y), s in rows])  # (4, 6)
         # (thrust tx ty tz) (N, 4) @ (4, 4) = rotor thrusts; the first row is a quarter each
-        self.allocation = torch.linalg.inv(self._effectiveness[:, 2:])[1:]  # (3, 4): rotor thrusts of torque x, y, z
+        self.allocation = torch.linalg.inv(self._effectiveness[:, 2:])[1:]  # (3, 4): rotor thrusts per torque x, y, z
         self._roll_pitch_to_rotors, self._yaw_to_rotors = self.allocation[:2], self.allocation[2:]
         self._torque_effectiveness = self._effectiveness[:, 3:].contiguous()  # (4, 3)
         self.motor_decay = math.exp(-p.physics_dt / p.motor_time_constant)
@@ -119,17 +119,17 @@ class Quadrotor:
         return _Drones(one, one.repeat(1, 3), one.clone(), one.clone(), one.clone(), delay)
 
     def own_parameters(self) -> tuple[Tensor, ...]:
-        """Each drone's own parameters, in tensors that stay in place.
+        """Return each drone's parameters, in tensors that are updated in place.
 
         Returns:
-            Mass (N, 1), inertia (N, 3), drag, thrust and torque (N, 1) relative to nominal, and the command's delay
-            (N,), int64 physics steps.
+            Mass (N, 1), inertia (N, 3), drag, thrust and torque (N, 1) relative to nominal, and the command delay (N,),
+            int64 physics steps.
         """
         drones = self._drones or self._nominal_drones()
         return tuple(getattr(drones, field.name) for field in fields(_Drones))
 
     def reset(self, mask: Tensor) -> None:
-        """Spin the rotors of the masked drones (N,) bool at hover, forget their commands, draw their parameters."""
+        """Reset the masked drones (N,) bool: rotors at hover, no pending commands, newly drawn parameters."""
         rows = mask.unsqueeze(-1)  # (N, 1)
         self.rotor_speed.masked_fill_(rows, self._hover_speed)
         self.setpoints.copy_(torch.where(rows, self._hover_setpoint, self.setpoints))
@@ -159,7 +159,7 @@ class Quadrotor:
             self._set_motors(rows, lag, widths.sag_max * self._uniform(self.num_drones, 1))
 
     def _set_motors(self, rows: Tensor, lag: Tensor | float, sag: Tensor | float) -> None:
-        """Give drones (N, 1) bool motors of a lag relative to nominal, and a battery that sags so far at full load."""
+        """Set the relative motor lag and the battery sag at full load of the masked drones (N, 1) bool."""
         assert self.rate_loop is not None
         motors = self.rate_loop.own[:, Own.MOTORS]
         decay = math.log(self.motor_decay) / (torch.ones_like(motors[:, :1]) * lag)
@@ -170,7 +170,7 @@ class Quadrotor:
         return torch.rand(shape, generator=self._generator, device=self._device, dtype=self._dtype)
 
     def state_dict(self) -> dict[str, Any]:
-        """Return what controllers and motors remember, and each drone's parameters."""
+        """Return the state of controllers and motors, and each drone's parameters."""
         drones = (
             None
             if self._drones is None
@@ -193,13 +193,13 @@ class Quadrotor:
             self.rate_loop.own.copy_(state_dict["rate_loop_own"])
 
     def command(self, action: Tensor) -> None:
-        """Take the actions (N, 4) in [-1, 1] of the coming control step: collective thrust and body rates x, y, z."""
+        """Set the actions (N, 4) in [-1, 1] of the next control step: collective thrust and body rates x, y, z."""
         action = action.to(self._device, self._dtype).clamp(-1.0, 1.0)
         setpoint = torch.addcmul(self._setpoint_offset, action, self._setpoint_scale)
         self.setpoints.copy_(torch.cat((setpoint.unsqueeze(0), self.setpoints[:-1])))
 
     def _setpoint(self, physics_step: int) -> Tensor:
-        """The setpoint (N, 4) that has arrived by this physics step of the control step."""
+        """Return the delayed setpoint (N, 4) at this physics step of the control step."""
         if self._drones is None:
             return self.setpoints[0]
         late = self._drones.delay_steps - physics_step  # (N,) physics steps still to wait for the newest command
@@ -207,10 +207,10 @@ class Quadrotor:
         return self.setpoints[age.clamp(0, len(self.setpoints) - 1), self._everyone]
 
     def wrench(self, physics_step: int, attitude: Tensor, linear_velocity: Tensor, body_rates: Tensor) -> Tensor:
-        """Advance controller and motors by one physics step and return the wrench on the body in its middle.
+        """Advance controller and motors by one physics step and return the mid-step wrench on the body.
 
-        The controller acts on the body rates half a step ahead, and the motors' speed is that of the middle of the
-        step: like this the step's length has an effect of second order only.
+        The proportional controller acts on the body rates half a step ahead, and the rotor speeds are those at
+        mid-step, so that the discretisation error is of second order.
 
         Args:
             physics_step: index within the control step, 0 … physics_steps − 1.
@@ -220,7 +220,7 @@ class Quadrotor:
 
         Returns:
             (N, 6) force in N and torque in N m, body frame, that give a body of *nominal* mass and inertia the
-            acceleration of this drone's own, so that all worlds can share one MuJoCo model.
+            acceleration of the randomised drone, so that all worlds can share one MuJoCo model.
         """
         setpoint = self._setpoint(physics_step)
         gyroscopic = self.gyroscopic_torque(body_rates)
@@ -240,7 +240,7 @@ class Quadrotor:
         return wrench
 
     def _note_effort(self, physics_step: int, asked: Tensor, targets: Tensor) -> None:
-        """Add a physics step, in which thrusts (N, 4) were chosen for a collective one (N, 1), to `effort`."""
+        """Add a physics step with commanded collective thrust (N, 1) and rotor thrust targets (N, 4) to `effort`."""
         low, high = targets.aminmax(dim=1, keepdim=True)
         at_limit = (low <= self.thrust_min + 1e-6) | (high >= self.parameters.rotor_thrust_max - 1e-6)
         missing = (asked - targets.sum(1, keepdim=True)).clamp(min=0.0)
@@ -248,7 +248,7 @@ class Quadrotor:
         self.effort.copy_(new if physics_step == 0 else self.effort + new)
 
     def _turn_rotors(self, target: Tensor) -> Tensor:
-        """Let rotors follow target speeds (N, 4) in √N for a physics step; return their thrusts in its middle, N."""
+        """Advance rotors towards target speeds (N, 4) in √N by a physics step; return the mid-step thrusts, N."""
         decay: Tensor | float = self.motor_decay
         decay_half: Tensor | float = self._motor_decay_half
         if self.rate_loop is not None:
@@ -267,18 +267,18 @@ class Quadrotor:
         return thrusts
 
     def gyroscopic_torque(self, body_rates: Tensor) -> Tensor:
-        """ω × Jω of the nominal body (N, 3), N m, at body rates (N, 3), rad/s."""
+        """Return ω × Jω of the nominal body (N, 3), N m, at body rates (N, 3), rad/s."""
         return torch.linalg.cross(body_rates, self._inertia * body_rates)
 
     def rates_half_a_step_later(self, body_rates: Tensor, torque: Tensor, gyroscopic: Tensor) -> Tensor:
-        """Body rates (N, 3) in rad/s after half a physics step under a torque (N, 3), given ω × Jω (N, 3), N m."""
+        """Return body rates (N, 3), rad/s, after half a physics step under a torque (N, 3), given ω × Jω, N m."""
         return torch.addcmul(body_rates, torque - gyroscopic, self._half_step_per_inertia)
 
     def mix(self, thrust: Tensor, torque: Tensor) -> Tensor:
         """Distribute total thrust (N, 1) in N and torque (N, 3) in N m to rotor thrusts (N, 4) within their limits.
 
-        Where the four limits cannot give all, yaw torque is given up first, then total thrust, roll and pitch last
-        (and those together, keeping their direction) [choice].
+        If the limits cannot be met, yaw torque is reduced first, then total thrust, and roll and pitch last (together,
+        keeping their direction) [choice].
         """
         limit = self.parameters.rotor_thrust_max
         roll_pitch = _product(torque[:, :2], self._roll_pitch_to_rotors)  # (N, 4), zero mean
@@ -294,7 +294,7 @@ class Quadrotor:
     def _perturb(
         self, wrench: Tensor, attitude: Tensor, linear_velocity: Tensor, body_rates: Tensor, gyroscopic: Tensor
     ) -> Tensor:
-        """Add the drag of the step's middle, and map the wrench of drones of their own to the nominal body's."""
+        """Add the mid-step drag, and convert the wrench of randomised drones to that of the nominal body."""
         force, torque = wrench[:, :3], wrench[:, 3:]
         drones = self._drones if self.parameters.randomisation is not None else None
         velocity = rotate_inverse(attitude, linear_velocity)  # body frame
@@ -305,20 +305,20 @@ class Quadrotor:
             return (drones.thrust * force - drones.drag * self._drag * velocity) / drones.mass
 
         acceleration = with_drag(velocity) / self.parameters.mass + rotate_inverse(attitude, self._gravity)
-        change = acceleration - torch.linalg.cross(body_rates, velocity)  # as the turning body sees it, m/s²
+        change = acceleration - torch.linalg.cross(body_rates, velocity)  # in the rotating body frame, m/s²
         force = with_drag(torch.add(velocity, change, alpha=0.5 * self.parameters.physics_dt))
         if drones is None:
             return torch.cat((force, torque), dim=1)
         torque = drones.thrust * torque
         torque = torch.cat((torque[:, :2], drones.torque * torque[:, 2:]), dim=1)
         own_gyroscopic = torch.linalg.cross(body_rates, drones.inertia * self._inertia * body_rates)
-        # J₀ J⁻¹ (τ − ω × Jω) + ω × J₀ω: Euler's equation of the own body, written for the nominal one
+        # J₀ J⁻¹ (τ − ω × Jω) + ω × J₀ω: Euler's equation of the randomised body, written for the nominal one
         torque = (torque - own_gyroscopic) / drones.inertia + gyroscopic
         return torch.cat((force, torque), dim=1)
 
 
 def wrong_action_type(dtype: object) -> TypeError:
-    """Return the error for actions of a type that is none of floating-point numbers."""
+    """Return the error for actions that are not floating-point numbers."""
     return TypeError(f"Action of {dtype}: thrust and body rates are floating-point numbers in [-1, 1].")
 
 

@@ -1,13 +1,13 @@
-"""From setpoints to motor commands as a Betaflight does it, for N drones at once.
+"""Betaflight's rate loop, from setpoints to motor commands, for N drones at once.
 
-Channels are held and quantised; P, I and D act on the filtered gyro; the mixer scales the motors' range first and then
-moves the throttle, so that the correction fits (air mode). This is the statement in torch, an operation at a time, of
-what `simulator.fused_rate_loop` computes in a kernel. The numbers and their sources: `drone.betaflight`.
+Channels are held and quantised; P, I and D act on the filtered gyro; the mixer first scales the correction to the
+motors' range and then moves the throttle so that it fits (air mode). This is the torch reference of the kernel
+`simulator.fused_rate_loop`. The numbers and their sources: `drone.betaflight`.
 
-Not modelled, because the flight controller is set to it or the recording shows nothing of it: feedforward (off), RC
-smoothing (off), dynamic notches and RPM filters (no noise to filter), thrust linearisation and throttle boost (off).
+Not modelled, because they are switched off or without effect in the recording: feedforward (off), RC smoothing (off),
+dynamic notches and RPM filters (no noise to filter), thrust linearisation and throttle boost (off).
 
-Shapes: N drones; three axes are roll, pitch and yaw, FLU: +x right, +y nose down, +z left. Inside in deg/s, as there.
+Shapes: N drones; three axes are roll, pitch and yaw, FLU: +x right, +y nose down, +z left. Computes in deg/s.
 """
 
 import enum
@@ -22,61 +22,61 @@ from dreamer_racing.envs.drone.parameters import GRAVITY, QuadrotorParameters
 
 
 class Row(enum.IntEnum):
-    """What the firmware remembers between steps: rows of three numbers, one an axis unless it says otherwise."""
+    """Rows of the firmware's state, three numbers each, one per axis unless stated otherwise."""
 
     SETPOINT = 0  # deg/s, held
     SETPOINT_SPEED = 1  # deg/s², smoothed
-    SETPOINT_MEAN = 2  # deg/s², of this and the last frame
+    SETPOINT_MEAN = 2  # deg/s², mean of this and the last frame
     GYRO_LPF2 = 3  # deg/s
-    GYRO_LPF1 = 4  # deg/s, what P and I see
+    GYRO_LPF1 = 4  # deg/s, input of P and I
     DTERM_LPF1 = 5
-    DTERM_LPF2 = 6  # what D sees
-    P = 7  # lowpassed about yaw
-    RELAX = 8  # deg/s, lowpassed setpoint
+    DTERM_LPF2 = 6  # input of D
+    P = 7  # low-passed for yaw
+    RELAX = 8  # deg/s, low-passed setpoint
     I = 9  # noqa: E741 - the letter of PID
-    BOOST_1 = 10  # share by which D is raised, lowpassed
+    BOOST_1 = 10  # relative increase of D, low-passed
     BOOST_2 = 11
-    THROTTLE = 12  # held, as of the step before, steps until the next frame
-    ANTI_GRAVITY = 13  # first lowpass, second lowpass, unused
+    THROTTLE = 12  # held value, value in the previous step, steps until the next frame
+    ANTI_GRAVITY = 13  # first low-pass, second low-pass, unused
 
 
 class Own(enum.IntEnum):
-    """What may differ between drones: rows of three numbers."""
+    """Rows of the parameters that may differ between drones, three numbers each."""
 
     P = 0  # relative, by axis
     I = 1  # relative, by axis  # noqa: E741 - the letter of PID
     D = 2
-    FILTERS = 3  # relative: cut-offs of gyro, of D, unused
-    MOTORS = 4  # decay of a physics step, of half a step, share of thrust that the battery loses at full load
+    FILTERS = 3  # relative cut-offs of gyro and D filters, unused
+    MOTORS = 4  # decay in a physics step, in half a step, share of thrust lost to battery sag at full load
 
 
 MIX = ((-1.0, -1.0, 1.0, 1.0), (1.0, -1.0, 1.0, -1.0), (1.0, -1.0, -1.0, 1.0))
-"""Of roll, pitch and yaw by rotor: Betaflight's QUADX, yaw in FLU."""
+"""Mixer coefficients of roll, pitch and yaw by rotor: Betaflight's QUADX, yaw in FLU."""
 
 
 def lowpass_gain(cutoff: Tensor | float, dt: float) -> Tensor | float:
-    """Return by which share a first-order low-pass moves to its input in a step, as Betaflight's PT1 does."""
+    """Return the gain of a first-order low-pass in a step of ``dt``, as in Betaflight's PT1."""
     omega = 2.0 * math.pi * dt * cutoff
     return omega / (omega + 1.0)
 
 
 def dynamic_cutoff(ends: tuple[float, float], expo: float, throttle: Tensor) -> Tensor:
-    """Return the cut-off in Hz at a throttle."""
+    """Return the cut-off in Hz at a throttle in [0, 1]."""
     return ends[0] + (ends[1] - ends[0]) * throttle * (1.0 + (1.0 - throttle) * expo)
 
 
 class RateLoop:
-    """N flight controllers.
+    """Rate loops of N Betaflight flight controllers.
 
     Args:
         parameters: the drone, whose `betaflight` is set.
         num_drones: N.
-        device: where the tensors live.
+        device: device of the tensors.
         dtype: floating-point type.
 
     Attributes:
-        state: (N, rows of `Row`, 3) what they remember; it stays in place.
-        own: (N, rows of `Own`, 3) by what they differ; it stays in place.
+        state: (N, rows of `Row`, 3) their state, updated in place.
+        own: (N, rows of `Own`, 3) their individual parameters, updated in place.
 
     Example:
         >>> from dataclasses import replace
@@ -102,7 +102,7 @@ class RateLoop:
             return torch.tensor(values, device=device, dtype=dtype)
 
         p = self.parameters
-        self.thrust_max = 4.0 * parameters.rotor_thrust_max  # N, of full command
+        self.thrust_max = 4.0 * parameters.rotor_thrust_max  # N, at full command
         self.full_stick = tensor([full_stick(rate) for rate in parameters.body_rate_max])  # (3,) deg/s
         self.p = tensor(p.p) * betaflight.P_SCALE
         self.i = tensor(p.i) * betaflight.I_SCALE * tensor((1.0, 1.0, betaflight.YAW_I_SCALE))
@@ -110,7 +110,7 @@ class RateLoop:
         pairs = zip(p.d, p.d_max, strict=True)
         self.d_rise = tensor([max(high / low - 1.0, 0.0) if low else 0.0 for low, high in pairs])  # (3,) at most
         self.sum_limit = tensor(p.sum_limit)
-        self.p_gain = tensor((1.0, 1.0, lowpass_gain(p.yaw_lowpass, self.dt)))  # of P's lowpass: about yaw alone
+        self.p_gain = tensor((1.0, 1.0, lowpass_gain(p.yaw_lowpass, self.dt)))  # of P's low-pass: yaw only
         self.level = tensor((1.0, 1.0, 0.0))  # axes with I-term relax and anti-gravity
         self.mix = tensor(MIX)  # (3, 4)
         self.state = torch.zeros(num_drones, len(Row), 3, device=device, dtype=dtype)
@@ -119,10 +119,10 @@ class RateLoop:
         self.reset(torch.ones(num_drones, 1, dtype=torch.bool, device=device))
 
     def reset(self, rows: Tensor, phase: Tensor | float = 0.0) -> None:
-        """Forget everything of drones (N, 1) bool, as if they had hovered.
+        """Reset the state of the masked drones to that in hover.
 
         Args:
-            rows: which.
+            rows: mask of the drones, (N, 1) bool.
             phase: (N,) physics steps until the link's next frame.
         """
         fresh = torch.zeros_like(self.state)
@@ -131,7 +131,7 @@ class RateLoop:
         self.state.copy_(torch.where(rows.unsqueeze(-1), fresh, self.state))
 
     def _throttle(self, thrust: Tensor) -> Tensor:
-        """Return the throttle in [0, 1] that the firmware makes of a link's channel, in whole µs, for a thrust in N."""
+        """Return the firmware's throttle in [0, 1] for a thrust in N, sent over a channel in whole µs."""
         p = self.parameters
         motor = (thrust / self.thrust_max).clamp(0.0, 1.0).sqrt()
         share = (motor - p.motor_idle) / (1.0 - p.motor_idle)
@@ -139,7 +139,7 @@ class RateLoop:
         return ((share * way + 0.5).floor() / way).clamp(0.0, 1.0)
 
     def receive(self, setpoint: Tensor) -> None:
-        """Take the channels where a frame of the link is due.
+        """Update the channels of the drones for which a link frame is due.
 
         Args:
             setpoint: (N, 4) collective thrust in N, body rates in rad/s.
@@ -168,8 +168,8 @@ class RateLoop:
         """Advance by one physics step; return the motor commands (N, 4) in [idle, 1].
 
         Args:
-            setpoint: (N, 4) collective thrust in N and body rates in rad/s that have arrived at the link.
-            body_rates: (N, 3) rad/s, what the gyro measures.
+            setpoint: (N, 4) collective thrust in N and body rates in rad/s at the link's receiver.
+            body_rates: (N, 3) rad/s, the gyro measurement.
         """
         self.receive(setpoint.to(self.state))
         throttle = self.state[:, Row.THROTTLE, :1]
@@ -178,13 +178,13 @@ class RateLoop:
         return self._mix(correction / 1000.0, throttle)
 
     def _lowpass(self, row: Row, value: Tensor, gain: Tensor | float) -> Tensor:
-        """Move a row of the state to a value (N, 3) by a share; return it as it is then."""
+        """Low-pass a value (N, 3) into a row of the state; return the filtered value."""
         moved = self.state[:, row] + gain * (value - self.state[:, row])
         self.state[:, row] = moved
         return moved
 
     def _correct(self, gyro: Tensor, throttle: Tensor) -> Tensor:
-        """Return P + I + D (N, 3), of 1000 of the motors' range."""
+        """Return P + I + D (N, 3), in thousandths of the motors' range."""
         p, own, dt = self.parameters, self.own, self.dt
         filters = own[:, Own.FILTERS]
         gyro = self._lowpass(Row.GYRO_LPF2, gyro, lowpass_gain(p.gyro_lpf2 * filters[:, :1], dt))
@@ -219,7 +219,7 @@ class RateLoop:
         return torch.minimum(torch.maximum(total, -self.sum_limit), self.sum_limit)
 
     def _feel_throttle(self, throttle: Tensor) -> None:
-        """Smooth the throttle's changes (N, 1) for anti-gravity, which feels more at low throttle and when it falls."""
+        """Low-pass the throttle's changes for anti-gravity, weighted more at low and at falling throttle (N, 1)."""
         p, state = self.parameters, self.state
         low = 1.0 - throttle
         change = throttle - state[:, Row.THROTTLE, 1:2]
@@ -231,7 +231,7 @@ class RateLoop:
         state[:, Row.THROTTLE, 1:2] = throttle.clone()
 
     def _mix(self, correction: Tensor, throttle: Tensor) -> Tensor:
-        """Distribute a correction (N, 3) of the motors' range; return motor commands (N, 4)."""
+        """Mix a correction (N, 3), as a share of the motors' range, and the throttle into motor commands (N, 4)."""
         idle = self.parameters.motor_idle
         mix = (correction.unsqueeze(-1) * self.mix).sum(1)  # (N, 4)
         low, high = mix.amin(1, keepdim=True).clamp(max=0.0), mix.amax(1, keepdim=True).clamp(min=0.0)

@@ -1,10 +1,10 @@
-"""One physics step of N drones: controller and motors give a wrench, MuJoCo moves the rigid bodies.
+"""One physics step of N drones: controller and motors compute a wrench, MuJoCo integrates the rigid bodies.
 
-This is the statement of the physics in torch, an operation at a time: what `simulator.fused_flight` is tested against.
-The simulators fly the fused kernels.
+This is the torch reference of the physics, against which `simulator.fused_flight` is tested. The simulators use the
+fused kernels.
 
 Shapes: N drones. SI units, attitude wxyz, `qpos` (N, 7) is position and attitude, `qvel` (N, 6) is the velocity in the
-world and the body rates in the body frame, as MuJoCo has them for a free joint.
+world and the body rates in the body frame, as in MuJoCo's free joint.
 """
 
 from collections.abc import Callable
@@ -19,18 +19,18 @@ from dreamer_racing.envs.drone.rotation import rotate, turn
 class RigidStep:
     """Quadrotors on MuJoCo's rigid bodies.
 
-    The force is held in the direction it has in the step's middle. Beyond that, MuJoCo's Euler step is of first order:
-    v' = v + h·a(x, v), then x' = x + h·v'. Over two seconds of racing that strays by 7 cm. Two corrections make it
-    second order (docs/simulation.md has the figures): the torque is turned into the one that does with the
-    rates of the step's beginning what the given one does with those of its middle, and half of the overshoot
-    h·(v' − v) is taken back from the pose. RK4 needs neither.
+    The force is applied in its mid-step direction. Still, MuJoCo's Euler step is first order: v' = v + h·a(x, v), then
+    x' = x + h·v', which accumulates an error of 7 cm over two seconds of racing. Two corrections make it second order
+    (docs/simulation.md has the figures): the torque is corrected for the difference between the gyroscopic torques at
+    the start and in the middle of the step, and half of the overshoot h·(v' − v) is subtracted from the pose. RK4
+    needs neither.
 
     Args:
         quadrotor: controllers and motors.
-        qpos: (N, 7) view of MuJoCo's state.
-        qvel: (N, 6) likewise.
-        qfrc_applied: (N, 6) likewise: force in the world frame, torque in the body frame.
-        integrate: makes one physics step with the present `qfrc_applied`.
+        qpos: (N, 7) view of MuJoCo's positions and attitudes.
+        qvel: (N, 6) view of MuJoCo's velocities and body rates.
+        qfrc_applied: (N, 6) view of MuJoCo's applied force (world frame) and torque (body frame).
+        integrate: makes one physics step with the current `qfrc_applied`.
     """
 
     def __init__(
@@ -50,11 +50,11 @@ class RigidStep:
         self._half_step = 0.5 * quadrotor.parameters.physics_dt
 
     def step(self, physics_step: int) -> None:
-        """Fly one physics step; the index counts within the control step."""
+        """Simulate one physics step, given its index in the control step."""
         self.apply(self.quadrotor.wrench(physics_step, self.attitude, self.linear_velocity, self.body_rates))
 
     def apply(self, wrench: Tensor) -> None:
-        """Move the bodies for one physics step under a wrench (N, 6), body frame, N and N m."""
+        """Move the bodies by one physics step under a wrench (N, 6), body frame, N and N m."""
         force, torque = wrench[:, :3], wrench[:, 3:]
         gyroscopic = self.quadrotor.gyroscopic_torque(self.body_rates)
         rates = self.quadrotor.rates_half_a_step_later(self.body_rates, torque, gyroscopic)

@@ -29,7 +29,7 @@ def turn(attitude: Tensor, rotation: Tensor) -> Tensor:
 
 
 def from_roll_pitch_yaw(roll: Tensor, pitch: Tensor, yaw: Tensor) -> Tensor:
-    """Attitude (..., 4), wxyz, of intrinsic z-y'-x'' (yaw, pitch, roll) angles in radians, each (...)."""
+    """Return attitudes (..., 4), wxyz, from intrinsic z-y'-x'' (yaw, pitch, roll) angles in radians, each (...)."""
     cr, sr = torch.cos(roll / 2), torch.sin(roll / 2)
     cp, sp = torch.cos(pitch / 2), torch.sin(pitch / 2)
     cy, sy = torch.cos(yaw / 2), torch.sin(yaw / 2)
@@ -47,7 +47,7 @@ def from_roll_pitch_yaw(roll: Tensor, pitch: Tensor, yaw: Tensor) -> Tensor:
 def align(body: Tensor, world: Tensor) -> Tensor:
     """Return the attitudes (..., 4), wxyz, that best rotate body-frame vectors (..., K, 3) into world ones (..., K, 3).
 
-    Best by the sum of squared distances; longer vectors count for more. With K ≥ 2 that are not parallel it is unique.
+    They minimise the sum of squared distances, and are unique for K ≥ 2 vectors that are not parallel.
 
     Reference: Horn 1987, "Closed-form solution of absolute orientation using unit quaternions", Section 4.
     """

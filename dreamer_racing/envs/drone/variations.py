@@ -1,11 +1,11 @@
-"""Drones as YAML files: what `preset=` takes in place of a name, written by whoever has measured one.
+"""Drones as YAML files, for example of a measured drone, which `preset=` takes in place of a name.
 
-preset: betaflight          # of which the drone is a variation; the widths of its randomisation stay
+preset: betaflight          # the preset that the drone varies; the widths of its randomisation stay
 parameters:                 # fields of `QuadrotorParameters`, in SI units
   mass: 0.62
   betaflight:               # fields of `BetaflightParameters`
     p: [45, 47, 30]
-about: {}                   # where the numbers come from; not read
+about: {}                   # sources of the numbers; not read
 """
 
 from __future__ import annotations
@@ -21,19 +21,19 @@ from dreamer_racing.settings import quoted, suggestion
 
 T = TypeVar("T")
 SUFFIXES = (".yaml", ".yml")
-"""With which the names of such files end."""
+"""File name suffixes of drone files."""
 KEPT = "randomisation"
-"""Field that a variation does not change."""
+"""Field that a drone file does not change."""
 
 
 def write_variation(path: Path, preset: str, changes: Mapping[str, Any], about: Mapping[str, Any]) -> None:
-    """Write a drone.
+    """Write a drone file.
 
     Args:
-        path: The file; one that is there is replaced.
-        preset: Of which it is a variation.
-        changes: As `differing` returns them.
-        about: Where its numbers come from, plain values.
+        path: The file; an existing one is replaced.
+        preset: The preset that the drone varies.
+        changes: The changed fields, as returned by `differing`.
+        about: Sources of its numbers, plain values.
     """
     content = {"preset": preset, "parameters": dict(changes), "about": dict(about)}
     path.parent.mkdir(parents=True, exist_ok=True)
@@ -53,10 +53,10 @@ def differing(base: Any, changed: Any) -> dict[str, Any]:
 
 
 def read_variation(path: Path) -> tuple[Any, dict[str, Any]]:
-    """Return the preset of which a file's drone is a variation, and its changes.
+    """Return the preset that a drone file varies, and its changes.
 
     Raises:
-        ValueError: There is no such file, or it is no drone.
+        ValueError: The file does not exist or is not a drone file.
     """
     if not path.is_file():
         raise ValueError(f"preset={path}: there is no such file.")
@@ -71,10 +71,10 @@ def read_variation(path: Path) -> tuple[Any, dict[str, Any]]:
 
 
 def vary(base: T, changes: Mapping[str, Any]) -> T:
-    """Return a dataclass with fields of other values; lists become tuples.
+    """Return a copy of a dataclass with changed fields; lists become tuples.
 
     Raises:
-        ValueError: There is no such field, or a value is not allowed.
+        ValueError: A field does not exist, or a value is not allowed.
     """
     names = sorted({field.name for field in dataclasses.fields(base)} - {KEPT})  # type: ignore[arg-type]  # a dataclass, of any kind
     values: dict[str, Any] = {}

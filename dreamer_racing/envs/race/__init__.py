@@ -1,1 +1,1 @@
-"""The rules: gates, rewards, starts, the racing line and the scripted pilot that flies it."""
+"""Race rules: gates, rewards, starts, the racing line and the scripted pilot that flies it."""

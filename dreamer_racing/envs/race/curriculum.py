@@ -1,4 +1,4 @@
-"""Curriculum of the body-rate penalty: the schedule of b₂ and today's b₂ on the rewards of old steps.
+"""Curriculum of the body-rate penalty: the schedule of b₂, and relabelling of replayed rewards with the current b₂.
 
 Reference: paper, Eq. 1 (b₁ = 1, b₂ → 0.01) and Section IV-A: b₂ starts at 0 and grows once the total reward exceeds
 50. How fast it grows is this project's choice, see `BodyRateCurriculum`.
@@ -22,11 +22,11 @@ class BodyRateSchedule:
 
     Attributes:
         threshold: mean return above which b₂ grows.
-        increment: what b₂ grows by, 1/(rad/s).
-        maximum: cap of b₂, 1/(rad/s).
-        window: episodes that the mean is over; no growth before there are as many.
-        cooldown: least number of episodes between two growths.
-        relabel: whether rewards of replayed steps are recomputed with today's b₂.
+        increment: step by which b₂ grows, 1/(rad/s).
+        maximum: upper limit of b₂, 1/(rad/s).
+        window: number of episodes in the mean; b₂ does not grow before there are as many.
+        cooldown: minimum number of episodes between two increments.
+        relabel: whether rewards of replayed steps are recomputed with the current b₂.
     """
 
     threshold: float = 50.0
@@ -44,8 +44,8 @@ class BodyRateCurriculum:
     ``increment``, but at most once in ``cooldown`` episodes and never beyond ``maximum``. It never decreases.
 
     Args:
-        schedule: its numbers.
-        env: whose `body_rate_weight` is b₂; None: there is no race, and nothing to move.
+        schedule: the schedule of b₂.
+        env: the environment whose `body_rate_weight` is set; None if there is no race: `adapt` then does nothing.
 
     Raises:
         ValueError: a number is out of its range.
@@ -71,19 +71,19 @@ class BodyRateCurriculum:
 
     @property
     def body_rate_weight(self) -> float:
-        """Today's b₂, 1/(rad/s)."""
-        # A product, not a sum of increments: ten times 0.001 shall be 0.01.
+        """Current b₂, 1/(rad/s)."""
+        # a product, not a sum of increments, so that ten times 0.001 is exactly 0.01
         return min(self._growths * self.schedule.increment, self.schedule.maximum)
 
     def adapt(self, episodes: TensorDictBase) -> dict[str, float]:
-        """Set the penalty of what comes, by finished episodes ``[E]`` with a ``return``; return metrics."""
+        """Update the environment's b₂ from the ``return`` of finished episodes ``[E]``; return metrics."""
         if self.env is None:
             return {}
         self.env.body_rate_weight = self.update(episodes["return"])
         return {"curriculum/body_rate_weight": self.body_rate_weight}
 
     def update(self, episode_returns: Tensor | Sequence[float]) -> float:
-        """Accounts for finished training episodes, one by one in the given order.
+        """Update b₂ with finished training episodes, one by one in the given order.
 
         Args:
             episode_returns: undiscounted returns, ``(E,)``.
@@ -110,7 +110,7 @@ class BodyRateCurriculum:
         return {"returns": list(self._returns), "growths": self._growths, "since_growth": self._since_growth}
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
-        """Restore what `state_dict` returned, also in worlds that begin anew."""
+        """Restore what `state_dict` returned, and set the environment's b₂."""
         self._returns.clear()
         self._returns.extend(state_dict["returns"])
         self._growths = state_dict["growths"]
@@ -120,12 +120,12 @@ class BodyRateCurriculum:
 
 
 class RelabelReward(Transform):
-    """Replay transform that gives every sampled step today's reward: ``reward_base − b₂ · body_rate_norm``.
+    """Replay transform that recomputes rewards with the current b₂: ``reward_base − b₂ · body_rate_norm``.
 
-    Without it, a replay returns the rewards with the b₂ of the day they were collected.
+    Without it, sampled rewards have the b₂ at the time of their collection.
 
     Args:
-        curriculum: whose b₂ is applied, read at each sample.
+        curriculum: source of b₂, read at each sample.
 
     Example:
         >>> transform = RelabelReward(BodyRateCurriculum())

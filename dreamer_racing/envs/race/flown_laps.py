@@ -1,4 +1,4 @@
-"""What a pilot's laps come to: whole episodes flown and added up.
+"""Evaluation of a scripted pilot: fly whole episodes and summarise them.
 
 Shapes: N drones, L laps, T control steps. SI units.
 """
@@ -19,16 +19,16 @@ from dreamer_racing.envs.worlds import RaceWorlds
 
 @dataclass(frozen=True)
 class FlownLaps:
-    """What N episodes came to."""
+    """Statistics of N episodes."""
 
     gates: Tensor  # (N,) int64, passed
     finished: Tensor  # (N,) bool: all laps, no crash
     crash: Tensor  # (N,) int64 `CrashCause`
-    lap_times: Tensor  # (N, L) s; NaN where not flown; the first lap begins at rest
+    lap_times: Tensor  # (N, L) s; NaN if not completed; the first lap begins at rest
     speed_mean: Tensor  # (N,) m/s
     speed_max: Tensor  # (N,) m/s
     gate_offset_max: Tensor  # (N,) m
-    gate_in_view: Tensor  # (N,) fraction of the time in which the nose camera sees the target gate's centre
+    gate_in_view: Tensor  # (N,) fraction of time with the target gate's centre in the nose camera's image
 
 
 def fly_laps(
@@ -43,18 +43,18 @@ def fly_laps(
     seed: int = 0,
     episode_steps: int | None = None,
 ) -> FlownLaps:
-    """Fly N episodes to their ends.
+    """Fly N complete episodes and return their statistics.
 
     Args:
         track: name, path or `Track`.
         preset: physics preset or parameters.
         num_envs: N.
         laps: L.
-        pilot: who flies; a `ScriptedPilot` with default limits if None.
-        randomise: whether a preset's randomisation is on.
-        random_starts: start as training does, instead of at the start pose.
-        seed: of randomisation and starts.
-        episode_steps: control steps until an episode is given up; None for those of 30 s.
+        pilot: the pilot; a `ScriptedPilot` with default limits if None.
+        randomise: whether to use the preset's randomisation.
+        random_starts: start as in training, instead of at the start pose.
+        seed: seed of randomisation and starts.
+        episode_steps: control steps until an episode is truncated; None for 30 s.
     """
     parameters = load_preset(preset)
     worlds = RaceWorlds(
@@ -79,12 +79,12 @@ class _Step:
 
     outcome: RaceStep
     speed: Tensor  # m/s
-    seen: Tensor  # bool: the target gate
-    flew: Tensor  # bool: the episode was not over
+    seen: Tensor  # bool: the target gate's centre was in view
+    flew: Tensor  # bool: the episode had not ended before
 
 
 def _fly(worlds: RaceWorlds, pilot: ScriptedPilot) -> list[_Step]:
-    """Fly one episode in every world to its end."""
+    """Fly one complete episode in every world."""
     pilot.reset()
     worlds.reset()
     flying = torch.ones(worlds.num_envs, dtype=torch.bool, device=worlds.device)
@@ -99,14 +99,14 @@ def _fly(worlds: RaceWorlds, pilot: ScriptedPilot) -> list[_Step]:
 
 
 def _in_view(worlds: RaceWorlds, position: Tensor, attitude: Tensor) -> Tensor:
-    """Whether the centre of the target gate (N,) is inside the nose camera's image; gates in front are not minded."""
+    """Return whether the target gate's centre is inside the nose camera's image, (N,); occlusion is ignored."""
     gates = worlds.track.gate_positions(position.device, position.dtype)[worlds.race.target_gate]
     seen = points_in_camera(position, attitude, gates.unsqueeze(1), worlds.camera)  # (N, 1, 3)
     return is_in_view(seen, worlds.camera).squeeze(1)
 
 
 def _summarise(steps: list[_Step], num_gates: int, laps: int) -> FlownLaps:
-    """Add up the control steps of a flight."""
+    """Compute the statistics of a flight from its control steps."""
     flew = torch.stack([step.flew for step in steps])  # (T, N)
     time = flew.sum(0)
 

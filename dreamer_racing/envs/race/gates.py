@@ -1,24 +1,24 @@
-"""Passes and crashes of N drones: the only place that decides them.
+"""Detection of gate passes and crashes of N drones.
 
 Shape legend: N drones, P physics steps per control step, G race gates. SI units, world z up.
 
-The path of one control step is a chain of P straight segments. On it, three kinds of event have an exact time,
-counted in segments (1.5 is the middle of the second segment):
+The path of one control step is a chain of P straight segments. Each event on it has an exact time, counted in segments
+(1.5 is the middle of the second segment):
 
 * a race gate's plane is crossed inside the frame's outer square: through the margin-reduced opening in the direction
-  of flight (a pass if it is the target gate, else nothing), through it backwards (crash), or anywhere else (crash);
-* a frame is touched from whatever side: it is a box as deep as the frame, around the margin-reduced opening (crash);
-* if misses end episodes: the target gate's plane is crossed in the direction of flight beside its frame (crash);
+  of flight (a pass if it is the target gate, else no event), through it backwards (crash), or outside it (crash);
+* a frame is touched from any side: it is a box of the frame's depth, around the margin-reduced opening (crash);
+* if misses end episodes: the target gate's plane is crossed in the direction of flight outside its frame (crash);
 * the free box is left: the ground at 0.05 m, or the track's bounding box (crash);
 * the position is not finite (crash).
 
 Crossing rule. A drone is *ahead* of a plane when its signed distance along the direction of flight is >= 0, and a
 crossing is a change of *ahead* from one sample to the next: ``d0 < 0 <= d1`` forward, ``d0 >= 0 > d1`` backwards.
-Every sample is on exactly one side, so no crossing is lost or counted twice when a sample lies on the plane, and it
-makes no difference where a path is cut into segments or control steps.
+Every sample is on exactly one side, so no crossing is lost or counted twice when a sample lies on the plane, and the
+result does not depend on where a path is split into segments or control steps.
 
-The first crash ends the path: what comes after it does not count. A pass before the first crash of the same control
-step does count, and both are reported. A crash at the very moment of a pass wins. Decoys are no part of this.
+The first crash ends the path: later events do not count. A pass before the first crash of the same control step
+counts, and both are reported. At equal times, the crash wins. Decoy gates are ignored.
 """
 
 from __future__ import annotations
@@ -45,47 +45,47 @@ class CrashCause(enum.IntEnum):
     GATE_MISSED = 7
 
 
-_PARALLEL = 1e-30  # m: stands for a way of zero, by which nothing can be divided
+_PARALLEL = 1e-30  # m: replaces a displacement of zero in divisions
 
 
 class GateSweep(NamedTuple):
-    """What happened to each drone in one control step."""
+    """Gate passes and first crash of each drone in one control step."""
 
     passes: torch.Tensor
-    """(N,) int64: gates passed before any crash: 1, the target; 2, the one after it, too."""
+    """(N,) int64: gates passed before any crash: 1 for the target, 2 for the target and the next gate."""
     offset: torch.Tensor
-    """(N,) distance in the target's plane between its centre and the point of the pass, m; 0 where not passed."""
+    """(N,) distance in the target's plane between its centre and the point of the pass, m; 0 if not passed."""
     crash: torch.Tensor
     """(N,) int64: the ``CrashCause`` of the first crash, 0 where there was none."""
 
 
 class _Crossings(NamedTuple):
-    """How every segment meets every race gate's plane; all (G, P, N)."""
+    """Crossings of every race gate's plane by every segment, all (G, P, N); the others are valid where ``crossed``."""
 
     crossed: torch.Tensor  # bool
-    forward: torch.Tensor  # bool, where crossed: in the direction of flight
-    time: torch.Tensor  # segment index plus fraction, where crossed
-    left: torch.Tensor  # m from the gate's centre, where crossed
-    up: torch.Tensor  # m from the gate's centre, where crossed
+    forward: torch.Tensor  # bool: in the direction of flight
+    time: torch.Tensor  # segment index plus fraction
+    left: torch.Tensor  # m from the gate's centre
+    up: torch.Tensor  # m from the gate's centre
 
 
 class GateSweeper:
     """Finds the pass and the first crash of N drones on one track.
 
-    At most two passes are reported per control step, and no more than one where no gate lies within reach of the gate
-    before it: at 18 m/s a drone flies 0.36 m in a step of 20 ms. Work is laid out (gate, step, drone), so that the long
-    axis is contiguous, and uses no matrix product, whose reduced-precision modes would blur positions on a GPU.
+    At most two passes are reported per control step, and at most one if no gate lies within reach of the gate before
+    it: at 18 m/s a drone flies 0.36 m in a step of 20 ms. Tensors are laid out (gate, step, drone), so that the long
+    axis is contiguous. No matrix product is used, whose reduced-precision modes would degrade positions on a GPU.
 
     Args:
         track: the track; only its race gates, shape and bounding box matter.
-        device: where paths will be.
+        device: device of the paths.
         dtype: floating-point type of the paths.
-        miss_radius: the target gate's plane may not be crossed beside its frame and less than this from its centre, m;
-            0 allows it.
-        reach: the farthest that a drone gets in a control step, m.
+        miss_radius: crossing the target gate's plane outside its frame and less than this from its centre is a crash,
+            m; 0 allows it.
+        reach: the farthest that a drone flies in a control step, m.
 
     Raises:
-        ValueError: a miss radius within the frame.
+        ValueError: the miss radius is within the frame.
 
     Example:
         >>> from dreamer_racing.envs.tracks import load_track
@@ -111,7 +111,7 @@ class GateSweeper:
             return values.to(dtype).view(-1, 1, 1)
 
         self._cos, self._sin = column(cos), column(sin)
-        # A gate's centre in its own axes, subtracted from positions after they are turned into the same axes.
+        # Each gate's centre in its own axes, subtracted from positions rotated into the same axes.
         self._centre_forward, self._centre_left, self._centre_up = (
             column(x * cos + y * sin),
             column(y * cos - x * sin),
@@ -132,7 +132,7 @@ class GateSweeper:
             for gate, after in zip(track.gates, (*track.gates[1:], track.gates[0]), strict=True)
         )
 
-        self._picks = torch.device(device).type == "cpu"  # elsewhere picking drones out would wait for the device
+        self._picks = torch.device(device).type == "cpu"  # on CUDA, selecting drones would synchronise
         self._frame_low, self._frame_high = (
             corner.to(dtype).unsqueeze(-1) for corner in _frame_boxes(track, torch.stack((x, y, z)), yaw)
         )
@@ -143,7 +143,7 @@ class GateSweeper:
         self._high = torch.tensor(track.bounds_high, device=device, dtype=dtype).view(3, 1, 1)
         floor_cause = CrashCause.GROUND if low_z <= GROUND_HEIGHT else CrashCause.OUT_OF_BOUNDS
         wall = CrashCause.OUT_OF_BOUNDS
-        # One cause for each row of the table of times in `_first_crash`.
+        # One cause for each row of the times in `_first_crash`.
         self._causes = torch.tensor(
             [
                 CrashCause.GATE_FRAME,
@@ -157,14 +157,14 @@ class GateSweeper:
         )
 
     def __call__(self, path: torch.Tensor, target_gate: torch.Tensor) -> GateSweep:
-        """Sweep one control step.
+        """Find the passes and the first crash in one control step.
 
         Args:
             path: positions at the start and after each physics step, (P + 1, N, 3), m.
             target_gate: index of the next gate of each drone, (N,) int64.
 
         Returns:
-            The pass and the first crash of each drone.
+            The passes and the first crash of each drone.
         """
         num_drones = target_gate.shape[0]
         assert path.shape[1:] == (num_drones, 3), f"path is (P + 1, {num_drones}, 3), got {tuple(path.shape)}"
@@ -172,7 +172,7 @@ class GateSweeper:
         # (P + 1, N, 3) -> (3, P + 1, N)
         position = path.permute(2, 0, 1).contiguous()
         finite = position.isfinite().all(0)  # (P + 1, N)
-        # An infinite coordinate must not look like a place: no comparison with NaN is true.
+        # NaN in place of infinity, because no comparison with NaN is true
         position = torch.where(finite, position, math.nan)
         segment = torch.arange(path.shape[0] - 1, device=path.device, dtype=path.dtype).view(-1, 1)  # (P, 1)
 
@@ -215,7 +215,7 @@ class GateSweeper:
         )
 
     def _turn(self, position: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
-        """Return positions (3, P + 1, N) as forward, left and up of every race gate's centre, (G, P + 1, N) each."""
+        """Return positions (3, P + 1, N) relative to every race gate: forward, left and up, (G, P + 1, N) each."""
         x, y, z = position.unbind(0)
         forward = x * self._cos + y * self._sin - self._centre_forward
         left = y * self._cos - x * self._sin - self._centre_left
@@ -228,7 +228,7 @@ class GateSweeper:
         target_gate: torch.Tensor,
         after: torch.Tensor | None = None,
     ) -> tuple[torch.Tensor, torch.Tensor]:
-        """Return when the target gate is first passed (inf: never), after some time (N,), and the offset, both (N,)."""
+        """Return the time of the first target gate pass later than ``after`` (inf: none) and its offset, (N,)."""
         num_steps = through.shape[1]
         target = target_gate.view(1, 1, -1).expand(1, num_steps, -1)
         passing = (through & crossings.forward).gather(0, target).squeeze(0)  # (P, N)
@@ -244,10 +244,10 @@ class GateSweeper:
         return first_time, torch.hypot(left, up)
 
     def _touch_frames(self, position: torch.Tensor, segment: torch.Tensor) -> torch.Tensor:
-        """Return when a frame is first touched, (N,), inf if never; position is (3, P + 1, N)."""
-        # (3, 1, N) against (3, G, 1): most drones are nowhere near a frame
+        """Return the time of the first frame contact, (N,), inf if none; position is (3, P + 1, N)."""
+        # (3, 1, N) against (3, G, 1): most drones are not near a frame
         low, high = position.amin(1, keepdim=True), position.amax(1, keepdim=True)
-        # (N,); who is lost, and so nowhere, may have touched one before
+        # (N,); true also for non-finite paths, which may have touched a frame before
         near = ~((high < self._frame_low) | (low > self._frame_high)).any(0).all(0)
         time = torch.full_like(position[0, 0], math.inf)
         if not self._picks:
@@ -258,10 +258,10 @@ class GateSweeper:
         return time
 
     def _enter_bars(self, position: torch.Tensor, segment: torch.Tensor) -> torch.Tensor:
-        """As `_touch_frames`, of drones that may be near one.
+        """Return the same as `_touch_frames` for drones that may be near a frame.
 
-        Inside the outer box the distance from the gate's axis is greatest at either end of the way: there the way is
-        outside the opening, or nowhere.
+        Within the outer box, a segment is farthest from the gate's axis at one of its ends, so only the ends need to
+        be tested against the opening.
         """
         forward, left, up = self._turn(position)
         sides = (
@@ -280,33 +280,33 @@ class GateSweeper:
         return _first(touched, segment + torch.where(starts_outside, enter, out_of_opening.clamp(0, 1)))
 
     def _leave_box(self, position: torch.Tensor, segment: torch.Tensor) -> torch.Tensor:
-        """Return when each side of the free box is first left, (6, N): low x, y, z, high x, y, z; inf if never.
+        """Return the time at which each side of the free box is left, (6, N): low x, y, z, high x, y, z; inf if never.
 
         A sample outside counts even without a crossing (an episode that began there), from the segment's start.
         """
         clearance = torch.cat((position - self._low, self._high - position))  # (6, P + 1, N), negative outside
         before, after = clearance[:, :-1].clamp(min=0), clearance[:, 1:]
-        # `before` is NaN, hence not >= 0, where the position was lost: that crash has been found already.
+        # `before` is NaN, hence not >= 0, after a non-finite position: that crash is found elsewhere.
         leaving = (after < 0) & (before >= 0)
         time = torch.where(leaving, segment + before / (before - after), math.inf)
         return time.amin(1)
 
     def _first_crash(self, times: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-        """Return the earliest of the times (rows, N) of the causes, and its cause, both (N,).
+        """Return the earliest of the crash times (rows, N) and its cause, both (N,); at equal times the first row wins.
 
-        Of causes at the same time the first row wins.
+        The rows are in the order of `_causes`.
         """
         time, row = times.min(0)
         return time, torch.where(time.isfinite(), self._causes[row], int(CrashCause.NONE))
 
 
 def _first(event: torch.Tensor, time: torch.Tensor) -> torch.Tensor:
-    """Return the earliest time of an event for each drone, inf if it never happens: (..., N) -> (N,)."""
+    """Return the earliest time of an event for each drone, inf if it does not happen: (..., N) -> (N,)."""
     return torch.where(event, time, math.inf).flatten(0, -2).amin(0)
 
 
 def _frame_boxes(track: Track, centre: torch.Tensor, yaw: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-    """Return the lowest and the highest corner (3, G) of each frame's bounding box along the world's axes."""
+    """Return the lower and upper corners (3, G) of each frame's axis-aligned bounding box."""
     wide, deep = track.shape.outer / 2, track.shape.depth / 2
     sin, cos = yaw.sin().abs(), yaw.cos().abs()
     half = torch.stack((wide * sin + deep * cos, wide * cos + deep * sin, torch.full_like(yaw, wide)))
@@ -314,7 +314,7 @@ def _frame_boxes(track: Track, centre: torch.Tensor, yaw: torch.Tensor) -> tuple
 
 
 def _within(axis: torch.Tensor, half: float) -> tuple[torch.Tensor, torch.Tensor]:
-    """Return the fractions (G, P, N) of segments at which they come between -half and half, and are there no more.
+    """Return the fractions (G, P, N) of each segment at which it enters and leaves the interval [-half, half].
 
     Reference: Kay and Kajiya 1986, "Ray tracing complex scenes" (slabs).
     """
@@ -325,5 +325,5 @@ def _within(axis: torch.Tensor, half: float) -> tuple[torch.Tensor, torch.Tensor
 
 
 def _at(axis: torch.Tensor, fraction: torch.Tensor) -> torch.Tensor:
-    """Return where segments of an axis (G, P + 1, N) are at a fraction (G, P, N) of each."""
+    """Interpolate coordinates (G, P + 1, N) along each segment at a fraction (G, P, N)."""
     return torch.addcmul(axis[:, :-1], fraction, axis.diff(dim=1))

@@ -1,8 +1,8 @@
 """A scripted, state-based pilot that flies N drones along a planned racing line.
 
-`ScriptedPilot` finds where on the line (`envs.race.racing_line`) a drone is, and steers it with position and velocity
+`ScriptedPilot` projects a drone onto the line (`envs.race.racing_line`) and controls it with position and velocity
 feedback, acceleration and rate feedforward, and a prediction over the command delay. It is the reference for lap times,
-and a demonstrator: it also flies from the poses in which training episodes start.
+and a demonstrator: it can also fly from the start poses of training episodes.
 
 Shapes: N drones, K samples of the line. SI units, world z up, attitude wxyz, body frame FLU. All numbers are this
 project's choice.
@@ -24,19 +24,19 @@ from dreamer_racing.envs.tracks import Track, load_track
 
 @dataclass(frozen=True)
 class PilotGains:
-    """How the pilot corrects errors.
+    """Feedback gains and limits of the pilot.
 
     Args:
-        position: 1/s², acceleration per metre beside the line.
-        velocity: 1/s, acceleration per m/s across the line.
-        progress: 1/s, how fast the speed along the line returns to the line's own.
+        position: 1/s², acceleration per metre of lateral error.
+        velocity: 1/s, acceleration per m/s of lateral velocity error.
+        progress: 1/s, gain of the speed error along the line.
         attitude: 1/s², angular acceleration per radian of thrust axis error.
-        body_rate: 1/s, angular acceleration per rad/s.
-        yaw: 1/s, yaw rate per radian.
-        correction_max: m/s², greatest acceleration in answer to errors beside the line.
-        progress_max: m/s², greatest acceleration in answer to errors of speed along the line.
-        look_ahead: s, the nose points to where the line is this much later.
-        adaptation: 1/s, how fast the estimate of the thrust's scale follows the measurement.
+        body_rate: 1/s, angular acceleration per rad/s of rate error.
+        yaw: 1/s, yaw rate per radian of heading error.
+        correction_max: m/s², maximum acceleration from lateral errors.
+        progress_max: m/s², maximum acceleration from speed errors along the line.
+        look_ahead: s, the nose points to the line's position this much later.
+        adaptation: 1/s, rate at which the thrust scale estimate follows the measurement.
     """
 
     position: float = 14.0
@@ -52,17 +52,17 @@ class PilotGains:
 
 
 class ScriptedPilot:
-    """Flies N drones around a track from their states.
+    """Controller that flies N drones along the racing line of a track from their states.
 
-    It keeps each drone's last command and an estimate of its thrust's scale. A drone that is suddenly somewhere else
-    has started a new episode, so that nobody needs to tell; `reset` tells it anyway.
+    It keeps each drone's last command and an estimate of its thrust scale. It detects a new episode by a jump of the
+    drone's position; calling `reset` is optional.
 
     Args:
         track: name, path or `Track`.
-        parameters: preset or parameters of the drone; the pilot knows the nominal ones only.
-        limits: what the line may ask for; its `speed` is the knob of aggressiveness. None for the defaults.
-        gains: how errors are corrected.
-        device: where the states will be.
+        parameters: preset or parameters of the drone; the pilot uses only the nominal ones, without randomisation.
+        limits: limits of the line; its `speed` sets the aggressiveness. None for the defaults.
+        gains: the feedback gains; None for the defaults.
+        device: device of the states.
         dtype: floating-point type of the states and actions.
 
     Example:
@@ -72,9 +72,9 @@ class ScriptedPilot:
         torch.Size([1, 4])
     """
 
-    WINDOW = 0.25  # s: the line is searched from this much before the last gate to this much after the target gate
+    WINDOW = 0.25  # s: the line is searched from this long before the last gate to this long after the target gate
     SEARCH_DT = 0.02  # s between the points of the search
-    JUMP = 0.3  # m beyond its own motion: the drone has been put elsewhere
+    JUMP = 0.3  # m of displacement beyond the drone's own motion that indicates a reset
 
     def __init__(
         self,
@@ -98,11 +98,11 @@ class ScriptedPilot:
         self._last_position: Tensor | None = None  # (N, 3)
         self._last_velocity: Tensor  # (N, 3)
         self._last_command: Tensor  # (N, 4) m/s² and rad/s
-        self._last_thrust: Tensor  # (N, 1) m/s², what the motors were asked for, with their lag
+        self._last_thrust: Tensor  # (N, 1) m/s², commanded thrust after motor lag
         self._thrust_scale: Tensor  # (N, 1) real thrust over nominal
 
     def _make_search(self) -> None:
-        """Tabulate where on the line the drones of each target gate may be: times and positions (G, W, ·)."""
+        """Tabulate the points of the line that are searched for each target gate: times and positions (G, W, ·)."""
         line = self.line
         end = line.gate_times + self.WINDOW
         start = line.gate_times.roll(1) - self.WINDOW
@@ -114,7 +114,7 @@ class ScriptedPilot:
         self._search_positions = torch.stack(points)  # (G, W, 3)
 
     def reset(self, mask: Tensor | None = None) -> None:
-        """Forget the masked drones (N,) bool; all if None."""
+        """Clear the memory of the masked drones (N,) bool; of all if None."""
         if mask is None:
             self._last_position = None
         elif self._last_position is not None:
@@ -124,7 +124,7 @@ class ScriptedPilot:
     def act(
         self, position: Tensor, attitude: Tensor, linear_velocity: Tensor, body_rates: Tensor, target_gate: Tensor
     ) -> Tensor:
-        """Choose the actions of the coming control step.
+        """Compute the actions of the next control step.
 
         Args:
             position: (N, 3) m.
@@ -151,7 +151,7 @@ class ScriptedPilot:
         return torch.cat((thrust, rates / self._rate_max), dim=1).clamp(-1.0, 1.0)
 
     def _remember(self, position: Tensor, attitude: Tensor, velocity: Tensor, body_rates: Tensor) -> None:
-        """Forget the drones that are suddenly elsewhere; learn how strong the thrust of the others is."""
+        """Reset the memory of drones that jumped, and update the thrust scale estimate of the others."""
         dt, dynamics = self.parameters.control_dt, self._dynamics
         if self._last_position is None or len(self._last_position) != len(position):
             self._last_position, self._last_velocity = torch.full_like(position, math.nan), velocity
@@ -168,7 +168,7 @@ class ScriptedPilot:
         force = dynamics.force(velocity_mean, (velocity - self._last_velocity) / dt)
         measured = dynamics.collective_thrust(force, rotate(attitude, _unit_z(position)), velocity).unsqueeze(-1)
         surplus = (measured / self._last_thrust.clamp(min=5.0)).clamp(0.7, 1.3) - 1.0
-        # near the limit the mixer may give up thrust for roll and pitch, which is no property of the drone
+        # near the limit the mixer may trade thrust for roll and pitch, which must not affect the estimate
         known = (self._last_thrust > 8.0) & (self._last_thrust < 0.85 * dynamics.thrust_max)
         scale = (self._thrust_scale * (1.0 + self.gains.adaptation * dt * known * surplus)).clamp(0.8, 1.2)
         self._thrust_scale = torch.where(new, 1.0, scale)
@@ -177,7 +177,7 @@ class ScriptedPilot:
     def _predict(
         self, position: Tensor, attitude: Tensor, velocity: Tensor, body_rates: Tensor
     ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        """The state when the coming action takes effect, from the command before it."""
+        """Predict the state at the time at which the next action takes effect, under the previous command."""
         lag = self._latency
         settled = 1.0 - math.exp(-lag * self.parameters.rate_gain)
         later = torch.lerp(body_rates, self._last_command[:, 1:], settled * 0.5)
@@ -188,7 +188,7 @@ class ScriptedPilot:
         return position + lag * velocity, attitude, velocity + lag * acceleration, later
 
     def _find(self, position: Tensor, target_gate: Tensor) -> Tensor:
-        """The time on the line (N,) of its nearest point between the last gate and the target gate."""
+        """Return the time (N,) of the line's nearest point between the last gate and the target gate."""
         gap = self._search_positions[target_gate] - position.unsqueeze(1)  # (N, W, 3)
         nearest = gap.square().sum(-1).argmin(1, keepdim=True)
         time = self._search_times[target_gate].gather(1, nearest).squeeze(1)
@@ -198,10 +198,10 @@ class ScriptedPilot:
         return time + step.clamp(-self.SEARCH_DT, self.SEARCH_DT)
 
     def _desired_force(self, position: Tensor, velocity: Tensor, reference: Reference) -> tuple[Tensor, Tensor]:
-        """Specific force (N, 3) in m/s², and the speed along the line relative to the line's own (N, 1).
+        """Return the specific force (N, 3) in m/s², and the ratio of the speed along the line to the line's own (N, 1).
 
-        At a fraction λ of the line's speed the line asks for λ² of its acceleration, so that the drone can start from
-        rest and fall behind without being pushed off the line.
+        At a fraction λ of the line's speed, the line needs λ² of its acceleration, so the drone can start from rest or
+        fall behind without being pushed off the line.
         """
         gains = self.gains
         speed = reference.velocity.norm(dim=-1, keepdim=True).clamp(min=0.5)
@@ -220,7 +220,7 @@ class ScriptedPilot:
         return self._dynamics.force(velocity, acceleration), progress
 
     def _thrust(self, force: Tensor, attitude: Tensor, velocity: Tensor, time: Tensor) -> Tensor:
-        """Collective thrust (N, 1) in m/s²: the force along the present axis, and what the motors' lag would lose."""
+        """Return the collective thrust (N, 1) in m/s²: the force along the axis, plus motor lag compensation."""
         axis = rotate(attitude, _unit_z(velocity))
         thrust = self._dynamics.collective_thrust(force, axis, velocity).unsqueeze(-1)
         now, soon = self.line.at(time), self.line.at(time + self.parameters.motor_time_constant)
@@ -231,7 +231,7 @@ class ScriptedPilot:
     def _roll_pitch_rates(
         self, force: Tensor, attitude: Tensor, body_rates: Tensor, reference: Reference, progress: Tensor
     ) -> Tensor:
-        """Roll and pitch rates (N, 2) in rad/s that turn the thrust axis to the force."""
+        """Return roll and pitch rates (N, 2) in rad/s that align the thrust axis with the force."""
         gains, loop = self.gains, self.parameters.rate_gain
         wanted = torch.nn.functional.normalize(rotate_inverse(attitude, force), dim=-1)
         x, y, z = wanted.unbind(-1)
@@ -246,26 +246,26 @@ class ScriptedPilot:
         return rates[:, :2] / excess
 
     def _yaw_rate(self, position: Tensor, attitude: Tensor, time: Tensor) -> Tensor:
-        """Yaw rate (N, 1) in rad/s that points the nose to where the line goes."""
+        """Return the yaw rate (N, 1) in rad/s that points the nose ahead along the line."""
         view = self.line.at(time + self.gains.look_ahead).position - position
         x, y, _ = rotate_inverse(attitude, torch.nn.functional.normalize(view, dim=-1)).unbind(-1)
-        level = (x.square() + y.square()).sqrt()  # the less the target is beside the yaw axis, the less it says
+        level = (x.square() + y.square()).sqrt()  # near the yaw axis, the heading error is ill-conditioned
         rate = self.gains.yaw * level * torch.atan2(y, x)
         return rate.clamp(-self._rate_max[2], self._rate_max[2]).unsqueeze(-1)
 
 
 def _unit_z(like: Tensor) -> Tensor:
-    """World or body z for each row of a (N, 3) tensor."""
+    """Return the unit z axis for each row of a (N, 3) tensor."""
     return like.new_tensor((0.0, 0.0, 1.0)).expand_as(like)
 
 
 class PilotPolicy(TensorDictModuleBase):
     """The pilot as a policy of `DroneRacingEnv`: reads `("privileged", ...)`, writes `action`.
 
-    It needs no `is_init`: the pilot notices by itself that a drone has been put elsewhere.
+    It needs no `is_init`: the pilot detects resets itself.
 
     Args:
-        pilot: who flies.
+        pilot: the pilot.
 
     Example:
         >>> from dreamer_racing.envs import DroneRacingEnv
@@ -282,7 +282,7 @@ class PilotPolicy(TensorDictModuleBase):
         self.pilot = pilot
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Write the actions of the coming control step."""
+        """Write the actions of the next control step."""
         position, attitude, velocity, rates, gate = (tensordict.get(key) for key in self.in_keys)
         action = self.pilot.act(position, attitude, velocity, rates, gate.squeeze(-1))
         return tensordict.set("action", action.to(position))

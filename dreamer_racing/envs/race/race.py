@@ -1,7 +1,7 @@
-"""Episodes of N drones on one track: target gates, laps, time, the reward of Eq. 1, and the race as its drone feels it.
+"""Race rules for N drones on one track: target gates, laps, time, the reward of Eq. 1, and the race vector.
 
-The reward is split so that a replayed step can be given today's body-rate weight. The race vector, in the drone's own
-frame, is for state policies and informed losses.
+The reward is split in two parts so that a replayed step can be given the current body-rate weight. The race vector, in
+the drone's body frame, is for state-based policies and losses with privileged inputs.
 
 Shape legend: N drones, P physics steps per control step, G race gates. SI units, of the vector before scaling; world z
 up, body frame FLU, quaternions wxyz. Reference: paper, Eq. 1.
@@ -25,11 +25,11 @@ EPISODE_TIME = 20.0
 """Time after which a training episode is truncated, s [choice]."""
 
 MAX_SPEED = 50.0
-"""Up to which two gates in one control step both count, m/s: 2.7 times a drone's weight, and that weight, without drag
-over 30 m, give 47 [choice]."""
+"""Speed up to which two gates passed in one control step both count, m/s: a thrust of 2.7 times the weight plus the
+weight, over 30 m without drag, gives 47 [choice]."""
 
 EVALUATION_TIME = 30.0
-"""The same in evaluation, s: three laps of split_s take a good pilot 22 s [choice]."""
+"""Time after which an evaluation episode is truncated, s: three laps of split_s take a good pilot 22 s [choice]."""
 
 RACE_VECTOR_SIZE = 21
 VELOCITY, RATES, DISTANCE = 5.0, 5.0, 4.0  # m/s, rad/s, m
@@ -47,18 +47,18 @@ RACE_VECTOR_ENTRIES = (
 
 @dataclasses.dataclass(frozen=True)
 class RaceStep:
-    """What one control step did to each drone; every tensor is (N,)."""
+    """Outcome of one control step for each drone; every tensor is (N,)."""
 
     reward_base: Tensor
     """float: the reward at b₂ = 0 (Eq. 1)."""
     body_rate_norm: Tensor
-    """float: ‖ω‖ where Eq. 1 has a rate term, 0 on a pass or crash, rad/s."""
+    """float: ‖ω‖ in steps in which Eq. 1 has a rate term, 0 on a pass or crash, rad/s."""
     terminated: Tensor
     """bool: the drone crashed."""
     truncated: Tensor
     """bool: out of time, or the last lap is complete; never together with ``terminated``."""
     passes: Tensor
-    """int64: gates passed in this step; 2 only where gates lie within a control step's reach of each other."""
+    """int64: gates passed in this step; 2 only if gates lie within a control step's reach of each other."""
     gates_passed: Tensor
     """int64: gates passed in this episode."""
     gate_offset: Tensor
@@ -73,25 +73,25 @@ class RaceStep:
     """int64: the gate to pass next, after this step."""
 
     def reward(self, body_rate_weight: float) -> Tensor:
-        """Return the reward (N,) with a weight b₂ of the body rates. Reference: paper, Eq. 1."""
+        """Return the reward (N,) for a body-rate weight b₂. Reference: paper, Eq. 1."""
         return self.reward_base - body_rate_weight * self.body_rate_norm
 
 
 class Race:
-    """Keeps the episode of each of N drones.
+    """Tracks the race progress of N drones and computes their rewards.
 
-    A lap is G passes, from whichever gate the episode began. Lap 1 is timed from the start of the episode, a later lap
-    from the completion of the one before; times are whole control steps. A pass that comes before a crash in the same
-    step counts (gate, lap time), but the reward is the collision's and the episode is terminated.
+    A lap is G passes, whichever gate the episode began at. Lap 1 is timed from the start of the episode, a later lap
+    from the completion of the previous one; times are whole control steps. A pass before a crash in the same step
+    counts (gate, lap time), but the reward is the collision's and the episode is terminated.
 
     Args:
         track: the track.
         num_envs: number of drones N.
         weights: the weights of Eq. 1.
-        episode_steps: control steps after which an episode is truncated; None for those of 20 s.
+        episode_steps: control steps after which an episode is truncated; None for 20 s.
         laps: laps after which an episode is truncated as finished (evaluation); None to fly until time is up.
         control_dt: duration of a control step, s.
-        device: where all tensors live.
+        device: device of all tensors.
         dtype: floating-point type of positions and rewards.
         miss_radius: see `GateSweeper`.
 
@@ -135,19 +135,19 @@ class Race:
         def zeros() -> Tensor:
             return torch.zeros(num_envs, dtype=torch.int64, device=device)
 
-        # all stay in place, so that a CUDA graph can advance them
+        # updated in place, so that a CUDA graph can advance them
         self.target_gate = zeros()  # (N,) gate to pass next
         self.gates_passed = zeros()  # (N,) in this episode
         self.step_count = zeros()  # (N,) control steps of this episode
-        self.lap_start_step = zeros()  # (N,) step at which the present lap began
+        self.lap_start_step = zeros()  # (N,) step at which the current lap began
         self.position = torch.zeros(num_envs, 3, dtype=dtype, device=device)  # (N, 3) at the last control step, m
 
     def begin(self, mask: Tensor, position: Tensor, target_gate: Tensor) -> None:
-        """Begin an episode for some of the drones and leave the others alone.
+        """Begin an episode for the masked drones.
 
         Args:
-            mask: which drones begin, (N,) bool.
-            position: where they begin, (N, 3), m; read only where masked.
+            mask: drones whose episode begins, (N,) bool.
+            position: their start positions, (N, 3), m; read only where masked.
             target_gate: the first gate to pass, (N,) int64; read only where masked.
         """
         self.position.copy_(torch.where(mask.unsqueeze(-1), position.to(self._dtype), self.position))
@@ -157,12 +157,12 @@ class Race:
         self.lap_start_step.masked_fill_(mask, 0)
 
     def step(self, path: Tensor, body_rates: Tensor, invalid_action: Tensor) -> RaceStep:
-        """Judge one control step and advance every episode by it.
+        """Apply the rules to one control step and advance every episode.
 
         Args:
             path: positions at the start of the step and after each physics step, (P + 1, N, 3), m.
             body_rates: angular velocity at the end of the step, (N, 3), rad/s.
-            invalid_action: the action was not finite, (N,) bool: a crash before the step's path, whose events are void.
+            invalid_action: the action was not finite, (N,) bool: a crash that voids all events of the step's path.
 
         Returns:
             The outcome for each drone; its tensors are not changed by later steps.
@@ -199,7 +199,7 @@ class Race:
         )
 
     def state_dict(self) -> dict[str, Tensor]:
-        """Return where every episode stands."""
+        """Return the progress of every episode."""
         return {name: getattr(self, name).clone() for name in self._EPISODE}
 
     def load_state_dict(self, state_dict: Mapping[str, Tensor]) -> None:
@@ -208,7 +208,7 @@ class Race:
             getattr(self, name).copy_(state_dict[name])
 
     def _judge(self, path: Tensor, body_rates: Tensor, invalid_action: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Return passes, offsets and crashes (N,) of the path, the action before it and the body rates after it."""
+        """Return passes, offsets and crashes (N,), from the path, a non-finite action and non-finite body rates."""
         passes, offset, crash = self._sweep(path, self.target_gate)
         rates_lost = (crash == CrashCause.NONE) & ~body_rates.isfinite().all(-1)
         crash = crash.masked_fill(rates_lost, CrashCause.NON_FINITE_STATE)
@@ -216,7 +216,7 @@ class Race:
         return passes.masked_fill(invalid_action, 0), offset.masked_fill(invalid_action, 0.0), crash
 
     def _advance(self, passes: Tensor, position: Tensor) -> tuple[Tensor, Tensor]:
-        """Move every episode on by one control step; return which laps it completed and their times (N,), s."""
+        """Advance every episode by one control step; return whether a lap was completed and its time, (N,), s."""
         num_gates = len(self._gate_positions)
         self.position.copy_(position)
         self.step_count += 1
@@ -234,13 +234,13 @@ class RewardWeights:
     """The weights of Eq. 1.
 
     Args:
-        progress: b₁, reward for each metre nearer to the target gate. Reference: paper, Table of reward parameters.
-        body_rate: b₂, penalty for each rad/s of body rate; a curriculum raises it to 0.01.
-        gate: reward of a control step in which the target gate was passed, instead of progress.
-        collision: reward of a control step that ends in a crash, instead of everything else.
+        progress: b₁, reward per metre of progress to the target gate. Reference: paper, Table of reward parameters.
+        body_rate: b₂, penalty per rad/s of body rate; a curriculum raises it to 0.01.
+        gate: reward per gate passed, in place of the progress reward in that control step.
+        collision: reward of a control step that ends in a crash, in place of all other terms.
 
     Raises:
-        ValueError: a weight is no finite number.
+        ValueError: a weight is not finite.
     """
 
     progress: float = setting(1.0, FINITE)
@@ -263,21 +263,21 @@ def race_reward(
 ) -> tuple[Tensor, Tensor]:
     """Return the two parts of Eq. 1; the reward is ``reward_base - weights.body_rate * body_rate_norm``.
 
-    A crash outweighs a pass of the same step. Both distances are to the gate that was the target during the step, so
-    after a pass the next step measures both to the new gate. Values that are not finite are allowed where crashed.
+    A crash overrides a pass in the same step. Both distances are to the gate that was the target during the step, so
+    after a pass the next step measures both to the new gate. Non-finite values are allowed where crashed.
 
     Args:
-        weights: the weights of Eq. 1; ``body_rate`` is left to the caller.
+        weights: the weights of Eq. 1; ``body_rate`` is not applied here.
         gate_position: centre of each drone's target gate, (N, 3), m.
         previous_position: position at the last control step, (N, 3), m.
         position: position now, (N, 3), m.
         body_rates: angular velocity, (N, 3), rad/s.
-        passes: gates passed in this step, each of which is paid, (N,) int64.
+        passes: gates passed in this step, each of which is rewarded, (N,) int64.
         crashed: the drone crashed in this step, (N,) bool.
 
     Returns:
-        ``reward_base`` (N,), the reward at b₂ = 0, and ``body_rate_norm`` (N,), rad/s: ‖ω‖ where Eq. 1 has a rate term,
-        0 on a pass or a crash.
+        ``reward_base`` (N,), the reward at b₂ = 0, and ``body_rate_norm`` (N,), rad/s: ‖ω‖, but 0 on a pass or crash,
+        where Eq. 1 has no rate term.
 
     Reference: paper, Eq. 1.
     """
@@ -290,13 +290,13 @@ def race_reward(
 
 
 class RaceVector:
-    """Computes the race vector of N drones, whose entries are those of ``RACE_VECTOR_ENTRIES``.
+    """Computes the race vector of N drones, with the entries listed in ``RACE_VECTOR_ENTRIES``.
 
     Every entry is of order one [choice of divisors].
 
     Args:
         track: The track.
-        device: Where the tensors live.
+        device: Device of the tensors.
         dtype: Floating-point type of the drones' state.
 
     Example:
@@ -316,7 +316,7 @@ class RaceVector:
         """Return the vectors, float32 ``(N, 21)``.
 
         Args:
-            state: Of the drones.
+            state: State of the drones.
             target_gate: The gate to pass next, int64 ``(N,)``.
         """
         gates = torch.stack((target_gate, (target_gate + 1) % len(self._positions)), 1)  # (N, 2)
@@ -334,18 +334,18 @@ class RaceVector:
         return torch.cat((body[:, :1], rates, body[:, 1:]), 1).flatten(1).float()
 
     def pose(self, vector: Tensor, target_gate: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Return where a drone is whose race looks like this, as well as one can say of vectors that are not exact.
+        """Estimate the poses of drones from race vectors, which may be inexact.
 
-        The attitude fits up, both gates' directions of flight and the line between them, by least squares; the position
-        is that from which the target gate lies where it seems to.
+        The attitude is a least-squares fit of the up direction, both gates' directions of flight and the line between
+        the gates; the position follows from the attitude and the vector to the target gate.
 
         Args:
             vector: As ``__call__`` returns them, ``(N, 21)``.
             target_gate: The gate to pass next, int64 ``(N,)``.
 
         Returns:
-            Positions ``(N, 3)`` in m, attitudes ``(N, 4)``, wxyz, and how badly these gates fit the vectors ``(N,)``:
-            the mean square of what is left, of vectors of length 1.
+            Positions ``(N, 3)`` in m, attitudes ``(N, 4)``, wxyz, and the misfit ``(N,)``: the mean squared residual of
+            the fit, for unit vectors.
         """
         gates = torch.stack((target_gate, (target_gate + 1) % len(self._positions)), 1)  # (N, 2)
         up, to_gate, direction, to_next, next_direction = vector.to(self._up.dtype).view(-1, 7, 3)[:, 2:].unbind(1)

@@ -1,8 +1,8 @@
-"""A fast periodic line through a track's gates, for the scripted pilot to fly.
+"""Planning of a fast periodic racing line through a track's gates, for the scripted pilot and start poses.
 
-The line is a chain of polynomials of degree 7 through the gate openings. Its nodes and durations are chosen by gradient
-descent on the lap time, with penalties where it would ask for more thrust or body rate than the drone has. What the
-search finds for tracks and drones that ship is stored beside this module; `store_lines` makes that file.
+The line is a chain of polynomials of degree 7 through the gate openings. Its nodes and durations are optimised by
+gradient descent on the lap time, with penalties for exceeding the drone's thrust or body rates. The results for
+built-in tracks and presets are stored beside this module; `store_lines` makes that file.
 
 Shapes: N queries, G race gates, M nodes of the line, S samples per segment, K samples of the finished line. SI units,
 world z up. All numbers are this project's choice.
@@ -25,26 +25,26 @@ from dreamer_racing.envs.tracks import BUILTIN_TRACKS, Track, load_track
 
 DEGREE = 7  # of a segment: position, velocity, acceleration and jerk are continuous
 LINE_DT = 0.005  # s between samples of the finished line
-SAMPLES = 12  # S, at which a segment must keep the limits
+SAMPLES = 12  # S, samples per segment at which the limits are checked
 ADAM_STEPS, LBFGS_STEPS = 200, 800
 STORED = Path(__file__).with_name("racing_lines.npz")
 
 
 @dataclass(frozen=True)
 class LineLimits:
-    """What the line may ask for.
+    """Limits of the racing line.
 
     Args:
-        speed: the fraction of the greatest collective thrust that the line may use; the one knob of aggressiveness.
-            0.9 leaves room for corrections and for a drone of the randomisation with 14 % less thrust; above 0.95 the
-            laps get no faster.
-        gate_offset: greatest distance from a gate's centre to the left and up, m; never above 40 % of the opening's.
-        body_rate_max: greatest roll and pitch rate, rad/s.
-        angular_acceleration_max: greatest roll and pitch acceleration, rad/s².
-        thrust_min: least collective thrust, m/s²; below it the drone's attitude has no direction.
-        gate_cosine: least cosine of the angle between the flight and a gate's normal.
-        clearance: distance from the bounding box, m.
-        height_min: least height, m.
+        speed: largest fraction of the maximum collective thrust that the line may use; sets the aggressiveness. 0.9
+            leaves a margin for corrections and for randomised drones with 14 % less thrust; above 0.95 the laps get no
+            faster.
+        gate_offset: maximum distance from a gate's centre to the left and up, m; at most 40 % of the half opening.
+        body_rate_max: maximum roll and pitch rate, rad/s.
+        angular_acceleration_max: maximum roll and pitch acceleration, rad/s².
+        thrust_min: minimum collective thrust, m/s²; near zero thrust the attitude is undefined.
+        gate_cosine: minimum cosine of the angle between the velocity and a gate's normal.
+        clearance: minimum distance from the bounding box, m.
+        height_min: minimum height, m.
     """
 
     speed: float = 0.9
@@ -58,18 +58,18 @@ class LineLimits:
 
 
 START_LINE = LineLimits(speed=0.7)
-"""Of the line on which training episodes begin: tame enough to fly on from with noise."""
+"""Limits of the line on which training episodes begin: slow enough to fly on from a noisy start."""
 
 
 @dataclass(frozen=True)
 class Reference:
-    """The line at one time per drone; every tensor is (N, 3)."""
+    """State of the line at one time per drone; every tensor is (N, 3)."""
 
     position: Tensor  # m
     velocity: Tensor  # m/s
     acceleration: Tensor  # m/s²
     thrust_rate: Tensor  # m/s³, rate of change of the specific thrust vector
-    body_rate: Tensor  # rad/s, world frame, without the part about the thrust axis
+    body_rate: Tensor  # rad/s, world frame, without the component about the thrust axis
     angular_acceleration: Tensor  # rad/s², world frame
 
 
@@ -78,9 +78,9 @@ class RacingLine:
 
     Args:
         samples: (K, 18) the columns of `Reference`, `LINE_DT`-spaced over one lap.
-        gate_times: (G,) s, when the line passes each gate.
+        gate_times: (G,) times at which the line passes each gate, s.
         lap_time: s.
-        dynamics: of the drone that it was planned for.
+        dynamics: dynamics of the drone for which it was planned.
     """
 
     def __init__(self, samples: Tensor, gate_times: Tensor, lap_time: float, dynamics: "Dynamics") -> None:
@@ -88,7 +88,7 @@ class RacingLine:
         self.dt = lap_time / len(samples)  # s
 
     def to(self, device: torch.device | str, dtype: torch.dtype) -> "RacingLine":
-        """The same line elsewhere."""
+        """Return a copy of the line on a device, with a dtype."""
         samples, gate_times = (values.to(device, dtype) for values in (self.samples, self.gate_times))
         return RacingLine(samples, gate_times, self.lap_time, self.dynamics)
 
@@ -103,7 +103,7 @@ class RacingLine:
 
 
 def _basis_rows(time: Tensor, order: int) -> Tensor:
-    """The `order`-th derivatives of 1, t, …, t⁷ at times (S,), as (S, 8)."""
+    """Return the `order`-th derivatives of 1, t, …, t⁷ at times (S,), as (S, 8)."""
     powers = [
         math.perm(n, order) * time ** (n - order) if n >= order else torch.zeros_like(time) for n in range(DEGREE + 1)
     ]
@@ -111,7 +111,7 @@ def _basis_rows(time: Tensor, order: int) -> Tensor:
 
 
 def _hermite_basis(time: Tensor) -> Tensor:
-    """Derivatives 0–3 at times (S,) in [0, 1] of the polynomial with given derivatives 0–3 at 0 and 1: (4, S, 8)."""
+    """Return the matrix (4, S, 8) from a polynomial's derivatives 0–3 at 0 and 1 to those at times (S,) in [0, 1]."""
     ends = torch.tensor([0.0, 1.0], dtype=time.dtype)
     conditions = torch.cat([_basis_rows(ends[i : i + 1], order) for i in range(2) for order in range(4)])
     inverse = torch.linalg.inv(conditions)
@@ -119,12 +119,12 @@ def _hermite_basis(time: Tensor) -> Tensor:
 
 
 class LineNodes:
-    """The free numbers of a line: nodes at the gates and between them, and the durations from each to the next.
+    """Optimisation variables of a line: nodes at and between the gates, and the durations of the segments.
 
     The search starts from a slow line of cubic arcs that leave and enter gates along their normals.
     """
 
-    SPACING = 4.0  # m between nodes, about
+    SPACING = 4.0  # m between nodes, approximately
     START_SPEED = 5.0  # m/s
     SCALES = (0.5, 2.0, 10.0, 100.0)  # of a node's position, velocity, acceleration and jerk in the search
 
@@ -134,19 +134,19 @@ class LineNodes:
         self.left = track.gate_rotations(dtype=dtype)[:, :, 1]
         self.gate_offset = min(gate_offset, 0.4 * track.shape.pass_half_width)
         gaps = self.gates.roll(-1, 0) - self.gates
-        turns = 1.0 - (self.normals * self.normals.roll(-1, 0)).sum(-1)  # 0 straight on, 2 for a reversal
-        lengths = 1.1 * gaps.norm(dim=-1) + 0.5 + 2.0 * turns  # of a generous arc, m
+        turns = 1.0 - (self.normals * self.normals.roll(-1, 0)).sum(-1)  # 0 for straight on, 2 for a reversal
+        lengths = 1.1 * gaps.norm(dim=-1) + 0.5 + 2.0 * turns  # upper estimate of the arc length, m
         self._counts = (gaps.norm(dim=-1) / self.SPACING).round().long().clamp(min=2)  # (G,) nodes from gate to gate
         self.gate_nodes = self._counts.cumsum(0) - self._counts  # (G,)
         arcs = [self._arc(gate, float(lengths[gate]), int(self._counts[gate])) for gate in range(len(self.gates))]
         self._start = torch.nn.functional.pad(torch.cat(arcs), (0, 0, 0, 2))  # (M, 4, 3)
-        self._start_duration = lengths / self.START_SPEED / self._counts  # (G,) of each of the equal segments
+        self._start_duration = lengths / self.START_SPEED / self._counts  # (G,) s per segment
         self._scales = torch.tensor(self.SCALES, dtype=dtype).view(4, 1)
         self.change = torch.zeros_like(self._start, requires_grad=True)  # (M, 4, 3)
         self.log_duration = torch.zeros_like(self._start_duration, requires_grad=True)  # (G,)
 
     def _arc(self, gate: int, length: float, count: int) -> Tensor:
-        """Positions and velocities (count, 2, 3) on the cubic arc from a gate to the next."""
+        """Return positions and velocities (count, 2, 3) on the cubic arc from a gate to the next."""
         here, there = gate, (gate + 1) % len(self.gates)
         gap, out, into = self.gates[there] - self.gates[here], length * self.normals[here], length * self.normals[there]
         t = (torch.arange(count, dtype=gap.dtype) / count).unsqueeze(-1)
@@ -155,22 +155,22 @@ class LineNodes:
         return torch.stack((position, self.START_SPEED * torch.nn.functional.normalize(slope, dim=-1)), dim=1)
 
     def free_numbers(self) -> np.ndarray:
-        """What the search chose, all in one row, as `restore` takes it."""
+        """Return the optimisation variables as one vector, for `restore`."""
         return torch.cat((self.change.flatten(), self.log_duration)).detach().numpy()
 
     def restore(self, numbers: Tensor) -> None:
-        """Take what an earlier search chose."""
+        """Set the optimisation variables to a result of `free_numbers`."""
         change, log_duration = numbers.tensor_split([self.change.numel()])
         with torch.no_grad():
             self.change.copy_(change.view_as(self.change))
             self.log_duration.copy_(log_duration)
 
     def durations(self) -> Tensor:
-        """Seconds from each node to the next (M,); between two gates they are equal."""
+        """Return the times from each node to the next (M,), s; between two gates they are equal."""
         return (self._start_duration * self.log_duration.exp()).repeat_interleave(self._counts)
 
     def nodes(self) -> Tensor:
-        """Position, velocity, acceleration and jerk of each node (M, 4, 3)."""
+        """Return position, velocity, acceleration and jerk of each node (M, 4, 3)."""
         nodes = self._start + self._scales * self.change
         left, up = (self.gate_offset * self.change[self.gate_nodes, 0, :2].tanh()).unsqueeze(-1).unbind(1)
         at_gates = self.gates + left * self.left + torch.nn.functional.pad(up, (2, 0))
@@ -178,50 +178,50 @@ class LineNodes:
         return nodes.index_copy(0, self.gate_nodes, rows)
 
     def segments(self) -> tuple[Tensor, Tensor]:
-        """Durations of the segments (M,), and the nodes at both of their ends per segment time (M, 8, 3)."""
+        """Return durations (M,), s, and derivatives 0–3 at both ends (M, 8, 3), in units of the segment's duration."""
         durations, nodes = self.durations(), self.nodes()
         powers = (durations.unsqueeze(-1) ** torch.arange(4)).unsqueeze(-1)  # (M, 4, 1)
         return durations, torch.cat((powers * nodes, powers * nodes.roll(-1, 0)), dim=1)
 
 
 class Dynamics:
-    """What a line asks of the drone."""
+    """Inverse dynamics of the drone: the thrust and thrust axis that a motion needs."""
 
     def __init__(self, parameters: QuadrotorParameters) -> None:
         x, y, z = parameters.drag
         self.drag_sideways = (x + y) / 2 / parameters.mass  # 1/s
-        self.drag_along = z / parameters.mass - self.drag_sideways  # 1/s, more along the thrust axis
+        self.drag_along = z / parameters.mass - self.drag_sideways  # 1/s, additional drag along the thrust axis
         self.thrust_max = 2.0 * parameters.collective_thrust_scale  # m/s²
 
     def force(self, velocity: Tensor, acceleration: Tensor) -> Tensor:
-        """Specific force (..., 3) in m/s² whose direction the thrust axis must have.
+        """Return the specific force (..., 3) in m/s² with which the thrust axis must be aligned.
 
-        Sideways drag is taken to be equal in x and y; the rest of the drag is along the thrust axis, and is made up by
+        Sideways drag is assumed equal in x and y; the remaining drag acts along the thrust axis and is compensated by
         thrust alone. Reference: Faessler et al., Differential Flatness of Quadrotor Dynamics Subject to Rotor Drag.
         """
         force = acceleration + self.drag_sideways * velocity
         return torch.cat((force[..., :2], force[..., 2:] + GRAVITY), dim=-1)
 
     def collective_thrust(self, force: Tensor, axis: Tensor, velocity: Tensor) -> Tensor:
-        """Collective thrust (...) in m/s² that gives the force (..., 3) along the thrust axis (..., 3)."""
+        """Return the collective thrust (...) in m/s² that gives the force (..., 3) along the thrust axis (..., 3)."""
         return (axis * (force + self.drag_along * velocity)).sum(-1)
 
 
 def _axis_rate(force: Tensor, force_rate: Tensor) -> tuple[Tensor, Tensor]:
-    """The thrust axis of a force and its angular velocity (..., 3) in rad/s, without the part about the axis."""
+    """Return a force's direction and its angular velocity, (..., 3), rad/s, without the component about the axis."""
     size = force.norm(dim=-1, keepdim=True).clamp(min=1e-6)
     axis = force / size
     return axis, torch.linalg.cross(axis, force_rate) / size
 
 
 def _excess(value: Tensor, limit: float) -> Tensor:
-    """Relative excess of values over a limit: squared where it is small, linear where it is large."""
+    """Return the Huber loss of the relative excess of values over a limit: quadratic if small, linear if large."""
     excess = (value / limit - 1.0).clamp(min=0.0)
     return torch.nn.functional.huber_loss(excess, torch.zeros_like(excess), reduction="none", delta=0.5) * 2.0
 
 
 def _steps(values: Tensor) -> Tensor:
-    """Differences from each sample of a closed line (M, S, 3) to the next."""
+    """Return the differences from each sample of a closed line (M, S, 3) to the next."""
     flat = values.flatten(0, 1)
     return (flat.roll(-1, 0) - flat).view_as(values)
 
@@ -229,7 +229,7 @@ def _steps(values: Tensor) -> Tensor:
 def _lap_cost(
     nodes: LineNodes, basis: Tensor, dynamics: Dynamics, limits: LineLimits, low: Tensor, high: Tensor
 ) -> Tensor:
-    """Lap time in s plus penalties where the line breaks the limits or leaves the box (low, high), both (3,)."""
+    """Return the lap time in s plus penalties for exceeding the limits or leaving the box (low, high), both (3,)."""
     durations, ends = nodes.segments()
     per_second = 1.0 / durations.view(-1, 1, 1)
     derivatives = torch.einsum("ksc,mcd->kmsd", basis, ends)  # (4, M, S, 3)
@@ -240,7 +240,7 @@ def _lap_cost(
     outside = (low - position).clamp(min=0.0).square() + (position - high).clamp(min=0.0).square()
     penalty = 300.0 * (_excess(thrust, limits.speed * dynamics.thrust_max) + outside.sum(-1))
     penalty = penalty + 300.0 * _excess(2.0 * limits.thrust_min - thrust, limits.thrust_min)
-    # between samples, so that the thrust axis cannot flip unseen where the force passes through zero
+    # differences between samples, to detect flips of the thrust axis where the force passes through zero
     per_second = basis.shape[1] / durations.unsqueeze(-1)
     axis_speed, rate_change = _steps(axis).norm(dim=-1) * per_second, _steps(body_rate).norm(dim=-1) * per_second
     penalty = penalty + 50.0 * _excess(axis_speed, limits.body_rate_max)
@@ -252,12 +252,12 @@ def _lap_cost(
 
 @lru_cache(maxsize=32)
 def plan_racing_line(track: Track, parameters: QuadrotorParameters, limits: LineLimits) -> RacingLine:
-    """Plan a fast closed line through all gates of a track: some seconds of CPU time, unless it is stored or cached.
+    """Plan a fast closed line through all gates of a track; takes some seconds unless it is stored or cached.
 
     Args:
         track: the track.
         parameters: the drone; only its mass, thrust and drag matter.
-        limits: what the line may ask for.
+        limits: the limits of the line.
 
     Returns:
         The line, float64 on CPU.
@@ -274,7 +274,7 @@ def plan_racing_line(track: Track, parameters: QuadrotorParameters, limits: Line
 
 
 def search_line(nodes: LineNodes, track: Track, dynamics: Dynamics, limits: LineLimits) -> None:
-    """Change the free numbers of a line until it is fast and within its limits."""
+    """Optimise the variables of a line for lap time within its limits."""
     basis = _hermite_basis(torch.arange(SAMPLES, dtype=torch.float64) / SAMPLES)
     low = torch.tensor(track.bounds_low, dtype=torch.float64) + limits.clearance
     high = torch.tensor(track.bounds_high, dtype=torch.float64) - limits.clearance
@@ -283,7 +283,7 @@ def search_line(nodes: LineNodes, track: Track, dynamics: Dynamics, limits: Line
 
 
 def line_key(track: Track, parameters: QuadrotorParameters, limits: LineLimits) -> str:
-    """The name in the file of stored lines: a hash of all numbers that the search reads."""
+    """Return the key of a stored line: a hash of all inputs of the search."""
     gates = [(gate.position, gate.yaw_degrees) for gate in track.gates]
     numbers = (gates, track.shape.pass_half_width, track.bounds_low, track.bounds_high, vars(Dynamics(parameters)))
     return hashlib.sha256(repr((numbers, limits)).encode()).hexdigest()[:16]
@@ -291,13 +291,13 @@ def line_key(track: Track, parameters: QuadrotorParameters, limits: LineLimits) 
 
 @cache
 def stored_lines() -> dict[str, Tensor]:
-    """The free numbers of lines that were searched before, by their keys."""
+    """Return the optimisation variables of the stored lines, by key."""
     with np.load(STORED, allow_pickle=False) as lines:
         return {key: torch.from_numpy(lines[key]) for key in lines.files}
 
 
 def store_lines() -> None:
-    """Search the lines of all tracks and drones that ship again, for the pilot and for starts, and store them."""
+    """Recompute and store the lines of all built-in tracks and presets, for the pilot and for start poses."""
     lines: dict[str, Any] = {}
     for track in map(load_track, BUILTIN_TRACKS):
         for drone in PRESETS.values():
@@ -310,7 +310,7 @@ def store_lines() -> None:
 
 
 def _descend(nodes: LineNodes, cost: Callable[[], Tensor]) -> None:
-    """Minimise the cost: Adam brings the line near the limits, L-BFGS makes it fast."""
+    """Minimise the cost: Adam first brings the line near the limits, then L-BFGS makes it fast."""
     variables = [nodes.change, nodes.log_duration]
 
     def evaluate() -> Tensor:

@@ -1,4 +1,4 @@
-"""Where episodes begin: at the start, at gates, and on the racing line.
+"""Start poses of episodes: at the start, before and behind gates, and on the racing line.
 
 Shape legend: N drones, G race gates. SI units, world z up, quaternions wxyz.
 """
@@ -18,7 +18,7 @@ from dreamer_racing.envs.tracks.validation import START_CLEARANCE, flyable_box
 
 @dataclasses.dataclass(frozen=True)
 class StartPose:
-    """Where episodes begin."""
+    """Poses, velocities and target gates with which N episodes begin."""
 
     position: torch.Tensor
     """(N, 3) m."""
@@ -31,37 +31,36 @@ class StartPose:
 
 
 class StartSampler:
-    """Draws the poses in which episodes begin [choice].
+    """Draws the start poses of episodes [choice].
 
-    Evaluation starts at the track's start pose, at rest; ``start_noise`` adds that many times the noise of training. In
-    training they start there too, but for a share ``at_gate``: those 1–3 m before a random race gate, facing it and
-    flying towards its centre at 1.5–2.5 m/s; all of them with uniform noise of ±0.5/0.5/0.3 m (forward/left/up of the
-    pose), ±5° roll and pitch, ±10° yaw. Positions are then moved into the free box, 0.3 m from its sides.
-    ``load_track`` accepts only tracks on which neither the noise nor this move can carry a drone across the plane of
-    its first gate. Where gates are so close that one of these poses is within the frame of another gate, the drone
-    begins at the start pose, at rest, without noise.
+    Evaluation episodes start at the track's start pose, at rest, with ``start_noise`` times the noise of training.
+    Training episodes start there too, except a share ``at_gate``, which starts 1–3 m before a random race gate, facing
+    it and flying towards its centre at 1.5–2.5 m/s. Both have uniform noise of ±0.5/0.5/0.3 m (forward/left/up of the
+    pose), ±5° roll and pitch, ±10° yaw. Positions are then clipped to the free box, 0.3 m from its sides.
+    ``load_track`` accepts only tracks on which neither the noise nor the clipping can move a drone across the plane of
+    its first gate. If a pose would be within the frame of another gate, the drone begins at the start pose instead, at
+    rest, without noise.
 
-    A share of the drones may begin beyond a gate instead: 0.6–2 m behind a random one, facing and flying along its
-    direction at 1.5–5 m/s, to the next gate. They practise the turn from one gate to the next before the policy flies
-    through the first well enough to get there.
+    A share of the drones may begin beyond a gate instead: 0.6–2 m behind a random gate, facing and flying along its
+    direction at 1.5–5 m/s. They practise the turn from one gate to the next before the policy flies through the first
+    well enough to get there.
 
     A share of the drones may begin on a racing line instead: at a random time of a lap, at a random fraction of the
-    line's speed, with the attitude that flies it and the nose to where the line leads, and noise: six tenths of the
-    above in position, along the world's axes, and as much in attitude. Every part of a lap is practised from the first
-    episode on, also turns whose gate is out of view. Reference: Peng et al. 2018, "DeepMimic", Section 6.2 (reference
-    state initialisation).
+    line's speed, with the attitude that this flight needs and the nose pointing ahead along the line. The position
+    noise is 0.6 times the above, along the world's axes; the attitude noise is the same. Every part of a lap is
+    practised from the first episode on, also turns whose gate is out of view. Reference: Peng et al. 2018,
+    "DeepMimic", Section 6.2 (reference state initialisation).
 
     Args:
         track: the track.
         generator: source of randomness, on the sampler's device; None for torch's own.
-        device: where the poses are wanted.
+        device: device of the poses.
         dtype: floating-point type of the poses.
-        beyond_gate: share of training episodes that begin beyond a gate, of those that do not begin on the line.
-        at_gate: share of training episodes that begin before a gate, of those that begin neither beyond one nor on the
-            line.
-        on_line: share of training episodes that begin on ``line``; all others are as if there was none.
+        beyond_gate: share of the training episodes not on the line that begin beyond a gate.
+        at_gate: share of the remaining training episodes that begin before a gate.
+        on_line: share of training episodes that begin on ``line``.
         line: the racing line; needed if ``on_line`` is above zero.
-        start_noise: of evaluation starts, as a multiple of the noise of training.
+        start_noise: noise of evaluation starts, as a multiple of the noise of training.
 
     Raises:
         ValueError: ``beyond_gate``, ``at_gate`` or ``on_line`` is not a share, there is no line, or ``start_noise`` is
@@ -79,11 +78,11 @@ class StartSampler:
     GATE_DISTANCE = (1.0, 3.0)  # m before a random gate
     SPEED = (1.5, 2.5)  # m/s towards a random gate
     BEYOND_DISTANCE = (0.6, 2.0)  # m behind a random gate: more than the noise
-    BEYOND_SPEED = (1.5, 5.0)  # m/s along its direction
+    BEYOND_SPEED = (1.5, 5.0)  # m/s along the gate's direction
     PACE = (0.2, 1.0)  # fraction of the line's speed
-    LINE_NOISE = 0.6  # times the position noise: less, to stay inside the gates that the line goes through
-    LOOK_AHEAD = 0.5  # s: the nose points to where the line is this much later
-    PAST_GATE = 1.0  # m around a gate's centre in which the side of its plane says whether it has been passed
+    LINE_NOISE = 0.6  # factor of the position noise, below 1 to stay inside the gates that the line goes through
+    LOOK_AHEAD = 0.5  # s: the nose points to the line's position this much later
+    PAST_GATE = 1.0  # m around a gate's centre in which the side of its plane decides whether it has been passed
 
     def __init__(
         self,
@@ -125,7 +124,7 @@ class StartSampler:
 
         Args:
             num: number of poses N.
-            evaluation: the track's start pose; without noise it draws nothing from the generator.
+            evaluation: whether to start at the track's start pose; without noise this draws no random numbers.
         """
         if evaluation:
             return self._start(num)
@@ -134,7 +133,7 @@ class StartSampler:
 
     @property
     def on_line(self) -> float:
-        """Share of training episodes that begin on the line; settable where there is one."""
+        """Share of training episodes that begin on the line; settable if there is a line."""
         return self._on_line
 
     @on_line.setter
@@ -159,11 +158,11 @@ class StartSampler:
         )
 
     def _training_start(self, num: int) -> StartPose:
-        """Draw noisy poses at the start, before random gates and beyond them."""
+        """Draw noisy poses at the start, before random gates and behind them."""
         draw = torch.rand(num, 9, generator=self._generator, device=self._device, dtype=self._dtype)
         gate = torch.randint(len(self._gate_yaws), (num,), generator=self._generator, device=self._device)
         beyond = draw[:, 0] < self._beyond_gate  # (N,)
-        at_gate = draw[:, 0] < self._beyond_gate + (1.0 - self._beyond_gate) * self._at_gate  # or beyond one
+        at_gate = draw[:, 0] < self._beyond_gate + (1.0 - self._beyond_gate) * self._at_gate  # before or beyond one
         before = _spread(draw[:, 1], self.GATE_DISTANCE)
         distance = torch.where(beyond, -_spread(draw[:, 1], self.BEYOND_DISTANCE), before)
         speed = torch.where(beyond, _spread(draw[:, 2], self.BEYOND_SPEED), _spread(draw[:, 2], self.SPEED))
@@ -185,7 +184,7 @@ class StartSampler:
         )
 
     def _in_a_frame(self, position: torch.Tensor) -> torch.Tensor:
-        """Return which positions (N, 3) are within the frame of a race gate, as `GateSweeper` has it, (N,) bool."""
+        """Return whether positions (N, 3) are within a race gate's frame, as `GateSweeper` defines it, (N,) bool."""
         # (N, 1, 3) from (G, 3) -> (N, G) each
         x, y, up = (position.unsqueeze(1) - self._gate_positions).unbind(-1)
         cos, sin, _ = self._gate_normals.unbind(-1)
@@ -204,7 +203,7 @@ class StartSampler:
         position = reference.position + self.LINE_NOISE * self._position_noise * noise[:, :3]
         position = torch.minimum(torch.maximum(position, self._low), self._high)
         velocity = pace * reference.velocity
-        # At a fraction of the speed the same curve asks for the square of that fraction of the acceleration.
+        # On the same curve, acceleration scales with the square of the speed.
         force = line.dynamics.force(velocity, pace.square() * reference.acceleration)
         ahead = line.at(time + self.LOOK_AHEAD).position - reference.position
         attitude = turn(_pointing(force, ahead), self._attitude_noise * noise[:, 3:])
@@ -217,7 +216,7 @@ class StartSampler:
         )
 
     def _next_gate(self, line: RacingLine, time: torch.Tensor, position: torch.Tensor) -> torch.Tensor:
-        """Return the gate (N,) that a drone near the line at a time has to pass next, whatever side noise put it on."""
+        """Return the next gate (N,) of drones near the line, corrected if noise moved a drone across a gate's plane."""
         num_gates = len(self._gate_yaws)
         gate = (time.unsqueeze(-1) >= line.gate_times).sum(-1) % num_gates
         last = (gate - 1) % num_gates
@@ -227,14 +226,14 @@ class StartSampler:
         return torch.where(near_last & ~beyond_last, last, gate)
 
     def _beside_gate(self, position: torch.Tensor, gate: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-        """Return which drones (N,) are near a gate's centre, and which are beyond its plane."""
+        """Return which drones (N,) are near their gate's centre, and which are beyond its plane."""
         offset = position - self._gate_positions[gate]
         return offset.norm(dim=-1) < self.PAST_GATE, (offset * self._gate_normals[gate]).sum(-1) >= 0.0
 
     def _disturb(
         self, origin: torch.Tensor, yaw: torch.Tensor, noise: torch.Tensor
     ) -> tuple[torch.Tensor, torch.Tensor]:
-        """Move level poses by noise (N, 6) in units of training's, and into the free box.
+        """Add noise (N, 6) to level poses, in units of the training noise, and clip them to the free box.
 
         Args:
             origin: (N, 3) m.
@@ -252,7 +251,7 @@ class StartSampler:
 
 
 def _check_share(name: str, share: float) -> None:
-    """Refuse what is no share of episodes."""
+    """Refuse a share outside [0, 1]."""
     if not 0.0 <= share <= 1.0:
         raise ValueError(f"{name}={share}: a share of episodes lies between 0 and 1.")
 
@@ -270,13 +269,13 @@ def _check_start_noise(start_noise: float, track: Track) -> None:
 
 
 def _spread(draw: torch.Tensor, interval: tuple[float, float]) -> torch.Tensor:
-    """Spread draws from [0, 1) over an interval."""
+    """Scale draws from [0, 1) to an interval."""
     low, high = interval
     return low + (high - low) * draw
 
 
 def _pointing(up: torch.Tensor, ahead: torch.Tensor) -> torch.Tensor:
-    """Return attitudes (N, 4) with z along ``up`` (N, 3) and x as near ``ahead`` (N, 3) as it can be."""
+    """Return attitudes (N, 4) with z along ``up`` (N, 3) and x as close to ``ahead`` (N, 3) as possible."""
     x, y, z = torch.nn.functional.normalize(up, dim=-1).unbind(-1)
     tilt = torch.nn.functional.normalize(torch.stack((1.0 + z, -y, x, torch.zeros_like(x)), -1), dim=-1)
     forward, left, _ = rotate_inverse(tilt, ahead).unbind(-1)

@@ -1,4 +1,4 @@
-"""Chooses the simulator for a device."""
+"""Choice of the simulator for a device."""
 
 import torch
 
@@ -14,10 +14,10 @@ BACKENDS = ("mujoco", "mujoco_warp")
 
 
 def check_device(device: torch.device | str) -> None:
-    """Refuse a device on which no world can live.
+    """Refuse a device that does not exist or is not supported.
 
     Raises:
-        ValueError: the message says what is there instead.
+        ValueError: the message says what is available.
     """
     if str(device).partition(":")[0] not in ("cpu", "cuda"):
         raise ValueError(f"device={str(device)!r}: worlds live on cpu or cuda.")
@@ -46,10 +46,10 @@ def make_simulator(
     backend: str = "auto",
     looks: LooksRandomisation | None = None,
 ) -> Simulator:
-    """Make the simulator of a backend; `auto` chooses by the device. Arguments: `RaceWorlds`; renderer None: no images.
+    """Make the simulator of a backend; `auto` chooses by device. Arguments: `RaceWorlds`; renderer=None: no images.
 
     Raises:
-        ValueError: unknown backend, or one that lacks what is asked for.
+        ValueError: unknown backend, or one that does not support the device or renderer.
     """
     device = torch.device(device)
     if backend == "auto":

@@ -1,4 +1,4 @@
-"""What the race needs of a simulator: the seam between the CPU backend and the CUDA one.
+"""`Simulator`: the interface of the CPU and CUDA backends.
 
 Shapes: N worlds, P physics steps per control step. SI units, attitude wxyz.
 """
@@ -29,22 +29,22 @@ class DroneState:
 
 
 class Simulator(ABC):
-    """N worlds with one drone each.
+    """Base class of simulators of N worlds with one drone each.
 
-    Controllers and motors are the same for every backend. A backend gives the tensors in which its engine keeps the
-    bodies, a function that moves them by one physics step, and images.
+    Controllers and motors are the same for every backend. A backend provides the engine's state tensors, a function
+    that advances them by one physics step, and images.
 
     Args:
         parameters: the drone.
         qpos: (N, 7) the engine's positions and attitudes.
-        qvel: (N, 6) its velocities (world) and body rates (body frame).
-        qfrc_applied: (N, 6) the forces (world) and torques (body frame) it takes.
+        qvel: (N, 6) the engine's velocities (world) and body rates (body frame).
+        qfrc_applied: (N, 6) the forces (world) and torques (body frame) that the engine applies.
         integrate: makes one physics step.
         generator: source of the physics randomisation, on the tensors' device.
 
     Attributes:
-        state: the present state; views that the next step overwrites.
-        looks: what the hall looks like in each world; None where that does not vary.
+        state: the current state; views that the next step overwrites.
+        looks: the sampler of each world's looks; None if looks do not vary.
     """
 
     looks: LooksSampler | None = None
@@ -67,7 +67,7 @@ class Simulator(ABC):
         self._flight = FusedFlight(self.quadrotor, qpos, qvel, qfrc_applied, integrate)
 
     def reset(self, mask: Tensor, position: Tensor, attitude: Tensor, linear_velocity: Tensor) -> None:
-        """Put the masked drones (N,) bool at the given poses (N, ·), not rotating, rotors at hover."""
+        """Set the masked drones (N,) bool to the given poses and velocities (N, ·), not rotating, rotors at hover."""
         rows = mask.unsqueeze(-1)
         pose = torch.cat((position, attitude), dim=1).to(self.dtype)
         velocity = torch.nn.functional.pad(linear_velocity.to(self.dtype), (0, 3))
@@ -79,7 +79,7 @@ class Simulator(ABC):
             self.looks.reset(mask)
 
     def step(self, action: Tensor) -> Tensor:
-        """Fly one control step with finite actions (N, 4).
+        """Simulate one control step with finite actions (N, 4).
 
         Returns:
             (P + 1, N, 3) positions from the start to the end of the step, one per physics step.
@@ -88,10 +88,10 @@ class Simulator(ABC):
         return self._flight.fly()
 
     def feel(self) -> Tensor:
-        """What gyro and accelerometer in each drone's centre show: body rates and specific force (N, 6).
+        """Return ideal gyro and accelerometer measurements of each drone: body rates and specific force (N, 6).
 
-        In rad/s and m/s², body frame, (0, 0, 9.81) at rest; of the last physics step, and where a drone was put, of one
-        that is not accelerated.
+        At its centre, in rad/s and m/s², body frame; the specific force is (0, 0, 9.81) at rest. It is that of the last
+        physics step; after a reset, that of an unaccelerated drone.
         """
         change = self.state.linear_velocity - self._flight.qvel_before[:, :3]
         change[:, 2] += GRAVITY * self.parameters.physics_dt
@@ -99,7 +99,7 @@ class Simulator(ABC):
         return torch.cat((self.state.body_rates, force), dim=1)
 
     def _frames(self, rows: Tensor | None) -> tuple[Tensor, Tensor, Looks | None]:
-        """Positions (M, 3), attitudes (M, 4) and looks of all worlds, or of M rows."""
+        """Return positions (M, 3), attitudes (M, 4) and looks of all worlds, or of M rows."""
         position, attitude = self.state.position, self.state.attitude
         looks = None if self.looks is None else self.looks.looks
         if rows is None:
@@ -108,17 +108,17 @@ class Simulator(ABC):
 
     @abstractmethod
     def render(self, rows: Tensor | None = None) -> Tensor:
-        """Images of the nose cameras, uint8 (M, height, width, 3).
+        """Return images of the nose cameras, uint8 (M, height, width, 3).
 
         Args:
-            rows: of which worlds, a mask (N,) bool or numbers (M,); of all if None.
+            rows: the worlds to render, a mask (N,) bool or indices (M,); all if None.
 
         Raises:
             RuntimeError: this simulator was made without a renderer.
         """
 
     def state_dict(self) -> dict[str, Any]:
-        """Return all that the next step depends on, for `torch.save`."""
+        """Return the complete state that the next step depends on, for `torch.save`."""
         return {
             "qpos": self._qpos.clone(),
             "qvel": self._qvel.clone(),
@@ -144,6 +144,6 @@ class Simulator(ABC):
 
 
 def no_images(closed: bool) -> RuntimeError:
-    """The error of asking a simulator for images that is closed, or was made without a renderer."""
+    """Return the error for rendering with a simulator that is closed or has no renderer."""
     reason = "is closed" if closed else "was made with renderer=None"
     return RuntimeError(f"This simulator has no images to give: it {reason}.")

@@ -1,4 +1,4 @@
-"""Where points lie to the nose camera: the pinhole of `scene.Camera`, stated in torch.
+"""Pinhole projection of `scene.Camera` in torch: points in the nose camera's axes, and whether they are in view.
 
 Shapes: M drones, L points.
 """
@@ -15,16 +15,16 @@ from dreamer_racing.envs.simulator.scene import Camera
 
 
 def points_in_camera(position: Tensor, attitude: Tensor, points: Tensor, camera: Camera) -> Tensor:
-    """Return points in the camera's own axes.
+    """Return points in the camera's axes.
 
     Args:
-        position: of the drone, (M, 3), m.
-        attitude: of the drone, (M, 4) wxyz, body → world.
-        points: in the world, (L, 3) or of each drone (M, L, 3), m.
+        position: positions of the drones, (M, 3), m.
+        attitude: attitudes of the drones, (M, 4) wxyz, body → world.
+        points: points in the world, (L, 3), or separate ones for each drone (M, L, 3), m.
         camera: the nose camera.
 
     Returns:
-        (M, L, 3) m: along the camera's axis, to the left, and up in the image.
+        (M, L, 3) m: along the optical axis, to the left, and up in the image.
     """
     mount = torch.tensor(camera.position, dtype=position.dtype, device=position.device)
     eye = position + rotate(attitude, mount.expand_as(position))  # (M, 3)
@@ -35,7 +35,7 @@ def points_in_camera(position: Tensor, attitude: Tensor, points: Tensor, camera:
 
 
 def is_in_view(points: Tensor, camera: Camera) -> Tensor:
-    """Tell which points (..., 3) in the camera's axes project into the image, (...) bool."""
+    """Return whether points (..., 3) in the camera's axes project into the image, (...) bool."""
     up = math.tan(math.radians(camera.field_of_view) / 2)
     left = up * camera.width / camera.height
     depth = points[..., 0]

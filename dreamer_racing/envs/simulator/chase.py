@@ -1,4 +1,4 @@
-"""Drones seen from outside: a camera follows each of them, drawn by OpenGL without a display.
+"""Chase views: a camera follows each drone from outside, rendered by OpenGL without a display.
 
 Shapes: N drones. SI units, world z up.
 """
@@ -22,27 +22,27 @@ from dreamer_racing.envs.simulator.rendering import RenderThread
 from dreamer_racing.envs.simulator.scene import DRONE_GROUP, HALL_GROUP, Camera, build_scene
 from dreamer_racing.envs.tracks import Track
 
-# choices of this project, for the looks of it
+# choices of this project, for appearance
 DISTANCE, HEIGHT = 1.0, 0.35  # m behind and above the drone
-AHEAD = 0.5  # m before the drone, where the camera looks
-BEYOND = 1.5  # m behind the target gate, towards which it looks
+AHEAD = 0.5  # m in front of the drone: the point at which the camera is aimed
+BEYOND = 1.5  # m behind the target gate: the point towards which the camera's heading turns
 FIELD_OF_VIEW = 70.0  # degrees
-TURNING_TIME = 0.25  # s in which the camera follows a turn
+TURNING_TIME = 0.25  # s, time constant of the camera's heading
 WALL_MARGIN, FLOOR_MARGIN = 0.1, 0.25  # m
-SAMPLES = 4  # a pixel, for smooth edges
+SAMPLES = 4  # per pixel, for anti-aliasing
 
 
 class ChaseView:
-    """Draws N drones from outside, each by a camera behind and above it that turns towards the gate to pass next.
+    """Renders N drones, each with a camera behind and above it that turns towards the target gate.
 
     Args:
-        track: the track. Its hall is drawn in nominal colours.
-        parameters: of the drones.
+        track: the track. Its hall is rendered in nominal colours.
+        parameters: parameters of the drones.
         num_envs: N.
         size: width and height of the images, pixels.
 
     Raises:
-        RendererUnavailableError: neither EGL nor OSMesa works here; the message says why and what helps.
+        RendererUnavailableError: neither EGL nor OSMesa works here; the message says why and how to fix it.
 
     Example:
         >>> from dreamer_racing.envs.tracks import load_track
@@ -59,30 +59,30 @@ class ChaseView:
         self._aims = (gates + BEYOND * track.gate_normals().double().numpy())[:, :2]  # (G, 2)
         self._low = np.add(track.bounds_low, (WALL_MARGIN, WALL_MARGIN, FLOOR_MARGIN))
         self._high = np.array(track.bounds_high) - WALL_MARGIN
-        self._heading = np.zeros((num_envs, 2))  # horizontal unit vectors in which the cameras look
+        self._heading = np.zeros((num_envs, 2))  # horizontal unit vectors of the cameras' headings
         self._time = np.full(num_envs, np.inf)
         camera = Camera(width=size, height=size, field_of_view=FIELD_OF_VIEW)
         spec = build_scene(track, parameters, camera)
         spec.visual.quality.offsamples = SAMPLES
         self._model = spec.compile()
         self._data = mujoco.MjData(self._model)
-        self._thread = RenderThread("chase")  # the OpenGL context is its own
+        self._thread = RenderThread("chase")  # owns the OpenGL context
         try:
             self._scene = self._thread.submit(_open, self._model, camera).result()
         except BaseException:
             self._thread.end(None)
             raise
         self._end = weakref.finalize(self, self._thread.end, self._scene.close)
-        self._end.atexit = False  # contexts are freed at exit as it is
+        self._end.atexit = False  # contexts are freed at exit anyway
 
     def draw(self, position: np.ndarray, attitude: np.ndarray, target_gate: np.ndarray, time: np.ndarray) -> np.ndarray:
-        """Draw the drones.
+        """Render the drones.
 
         Args:
-            position: (N, 3) m. A drone with a number that is not finite is not drawn: its image is black.
+            position: (N, 3) m. A drone with a non-finite pose is not rendered: its image is black.
             attitude: (N, 4) wxyz.
             target_gate: gates to pass next, (N,) int.
-            time: of each episode, (N,) s, by which the cameras turn. Where it is 0 or runs backwards one begins.
+            time: time of each episode, (N,) s, for the cameras' turning. At 0 or a decrease, an episode begins.
 
         Returns:
             uint8 RGB (N, size, size, 3), first row at the top.
@@ -97,7 +97,7 @@ class ChaseView:
         return images
 
     def _follow(self, position: np.ndarray, target_gate: np.ndarray, time: np.ndarray) -> None:
-        """Turn the cameras towards the gates, at once where an episode begins."""
+        """Turn the cameras towards the gates, immediately where an episode begins."""
         way = self._aims[target_gate] - position[:, :2]
         wanted = way / np.linalg.norm(way, axis=1, keepdims=True).clip(1e-9)
         passed = np.where((time == 0) | (time < self._time), np.inf, time - self._time)
@@ -124,7 +124,7 @@ class ChaseView:
 
 
 def _open(model: mujoco.MjModel, camera: Camera) -> OpenGLScene:
-    """Make the scene by the first OpenGL library that works."""
+    """Make the scene with the first OpenGL library that works."""
     reasons = []
     for backend in GL_LIBRARIES:
         try:

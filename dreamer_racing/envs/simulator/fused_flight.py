@@ -1,13 +1,12 @@
-"""`RigidStep` as two kernels a physics step: what controller, motors and corrections do between two steps of MuJoCo.
+"""`RigidStep` as two warp kernels per physics step: controller, motors and corrections around MuJoCo's step.
 
-`drone.quadrotor.Quadrotor` and `drone.rigid_step.RigidStep` state the same equations in torch, an operation at a time,
-and are what these kernels are tested against. Here they take a tenth of the time on a CPU, and a CUDA graph has a third
-of the nodes.
+`drone.quadrotor.Quadrotor` and `drone.rigid_step.RigidStep` are the torch reference of these equations, against which
+the kernels are tested. The kernels take a tenth of the time on a CPU, and a CUDA graph has a third of the nodes.
 
 Shapes: N drones, P physics steps per control step. SI units, attitude wxyz, body frame FLU.
 """
 
-# warp reads annotations, which are no types to mypy, as they are: no `from __future__ import annotations` here
+# warp evaluates annotations, which mypy does not accept as types: no `from __future__ import annotations` here
 # mypy: disable-error-code="valid-type,index,no-untyped-def"
 
 from collections.abc import Callable
@@ -28,10 +27,10 @@ class Kernels(NamedTuple):
     """The kernels of one floating-point type.
 
     Attributes:
-        push: Controller and motors of a physics step; writes the force and torque that MuJoCo is to apply.
-        settle: Corrects MuJoCo's Euler step and keeps the position it led to.
-        constants: The struct of what all drones have in common.
-        firmware: The struct within it of flight controllers.
+        push: Runs controller and motors for a physics step; writes the force and torque that MuJoCo applies.
+        settle: Corrects MuJoCo's Euler step and stores the resulting position.
+        constants: The struct of the constants common to all drones.
+        firmware: The struct in it of the flight controllers' constants.
     """
 
     push: Any
@@ -41,17 +40,17 @@ class Kernels(NamedTuple):
 
 
 class FusedFlight:
-    """N quadrotors on MuJoCo's rigid bodies.
+    """Simulates N quadrotors with MuJoCo's rigid bodies and fused kernels.
 
     Args:
-        quadrotor: controllers and motors, whose tensors are advanced in place.
-        qpos: (N, 7) view of MuJoCo's state.
-        qvel: (N, 6) likewise.
-        qfrc_applied: (N, 6) likewise: force in the world frame, torque in the body frame.
-        integrate: makes one physics step with the present `qfrc_applied`.
+        quadrotor: controllers and motors, whose tensors are updated in place.
+        qpos: (N, 7) view of MuJoCo's positions and attitudes.
+        qvel: (N, 6) view of MuJoCo's velocities and body rates.
+        qfrc_applied: (N, 6) view of MuJoCo's applied force (world frame) and torque (body frame).
+        integrate: makes one physics step with the current `qfrc_applied`.
 
     Attributes:
-        qvel_before: (N, 6) as it was before the last physics step.
+        qvel_before: (N, 6) `qvel` before the last physics step.
     """
 
     def __init__(
@@ -83,7 +82,7 @@ class FusedFlight:
             )
 
     def fly(self) -> Tensor:
-        """Fly one control step of the present command; return the positions (P + 1, N, 3) of all physics steps."""
+        """Simulate one control step with the current command; return the positions (P + 1, N, 3)."""
         self._path[0] = self._position
         with scope(self._device):
             for index in range(len(self._push)):
@@ -91,7 +90,7 @@ class FusedFlight:
         return self._path.clone()
 
     def step(self, physics_step: int) -> None:
-        """Fly one physics step; the index counts within the control step, and what exceeds it is its last."""
+        """Simulate one physics step, given its index in the control step; a larger index is taken as the last."""
         index = min(physics_step, len(self._push) - 1)
         self._push[index].launch()
         self._integrate()
@@ -99,7 +98,7 @@ class FusedFlight:
 
 
 def _constants(quadrotor: Quadrotor, struct: Any) -> Any:
-    """Fill the kernels' struct with what all drones have in common."""
+    """Fill the kernels' struct of constants common to all drones."""
     p = quadrotor.parameters
     x, y = zip(*p.rotor_positions, strict=True)
     constants = struct()
@@ -124,7 +123,7 @@ def _constants(quadrotor: Quadrotor, struct: Any) -> Any:
 
 @cache
 def make_kernels(dtype: torch.dtype) -> Kernels:
-    """Make the kernels of a floating-point type; warp compiles them at their first launch on a device, and caches."""
+    """Make the kernels for a floating-point type; warp compiles and caches them at the first launch."""
     wp = load_warp()
     real = wp.dtype_from_torch(dtype)
     vec3, vec4 = wp.types.vector(3, real), wp.types.vector(4, real)
@@ -135,16 +134,16 @@ def make_kernels(dtype: torch.dtype) -> Kernels:
     @wp.struct
     class Constants:
         firmware: Firmware
-        controlled: int  # whether there is such a flight controller
-        lag_of_thrust: int  # whether thrusts follow their targets, or speeds
+        controlled: int  # whether there is a Betaflight flight controller
+        lag_of_thrust: int  # whether thrusts have first-order lag, or speeds
         physics_steps: int
         oldest: int  # index of the oldest command kept
-        perturbed: int  # whether there is drag, or drones have parameters of their own
-        corrected: int  # whether MuJoCo's step is of first order
-        limit: real  # N, of a rotor
-        low: real  # N
-        decay: real  # of rotor speed towards its target, in a physics step
-        decay_half: real
+        perturbed: int  # whether there is drag, or drones are randomised
+        corrected: int  # whether MuJoCo's step is first order and is corrected
+        limit: real  # N, maximum thrust of a rotor
+        low: real  # N, minimum thrust of a rotor
+        decay: real  # factor of a rotor's deviation from its target per physics step
+        decay_half: real  # per half step
         half_step: real  # s
         rate_gain: real  # 1/s
         mass: real  # kg
@@ -219,7 +218,7 @@ def make_kernels(dtype: torch.dtype) -> Kernels:
         decay: real,
         decay_half: real,
         rotor_speed: wp.array2d(dtype=real),
-    ):  # towards target thrusts; returns those of the step's middle
+    ):  # moves rotors towards target thrusts; returns the thrusts at mid-step
         if c.lag_of_thrust != 0:
             lag = wp.cw_mul(speed, speed) - target
             for rotor in range(4):
@@ -232,7 +231,7 @@ def make_kernels(dtype: torch.dtype) -> Kernels:
         middle = goal + decay_half * (speed - goal)
         return wp.cw_mul(middle, middle)
 
-    # the wrench that gives the nominal body the acceleration of a drone's own
+    # the wrench that gives the nominal body the acceleration of the randomised drone
     @wp.func
     def own_force(c: Constants, thrust: vec3, velocity: vec3, rates: vec3, gravity: vec3, mass: real, drag: real):
         now = (thrust - drag * wp.cw_mul(c.drag, velocity)) / mass
@@ -295,7 +294,7 @@ def make_kernels(dtype: torch.dtype) -> Kernels:
             torque = thrust_factor[i, 0] * vec3(torque[0], torque[1], torque_factor[i, 0] * torque[2])
             torque = own_torque(c, torque, rates, vec3(inertia[i, 0], inertia[i, 1], inertia[i, 2]))
 
-        # the force in its direction of the step's middle, the torque that does there what this one does
+        # rotate the force to its mid-step direction, and correct the torque for the mid-step gyroscopic torque
         middle_rates = half_a_step_later(c, rates, torque)
         force = rotate(w, v, force + c.half_step * wp.cross(middle_rates, force))
         if c.corrected != 0:

@@ -1,9 +1,9 @@
-"""`RateLoop` as a function that the kernels of `fused_flight` call: one drone's firmware in one physics step.
+"""`RateLoop` as a warp function that the kernels of `fused_flight` call: one drone's firmware in one physics step.
 
-`drone.rate_loop.RateLoop` states the same in torch, and is what this is tested against.
+`drone.rate_loop.RateLoop` is the torch reference against which this is tested.
 """
 
-# warp reads annotations, which are no types to mypy, as they are: no `from __future__ import annotations` here
+# warp evaluates annotations, which mypy does not accept as types: no `from __future__ import annotations` here
 # mypy: disable-error-code="valid-type,index,no-untyped-def,operator"
 
 from functools import cache
@@ -18,11 +18,11 @@ from dreamer_racing.envs.simulator.warp_device import load_warp
 
 
 class Kernels(NamedTuple):
-    """What the kernels of one floating-point type need.
+    """The warp struct and function of one floating-point type.
 
     Attributes:
-        firmware: The struct of what all flight controllers have in common.
-        motor_commands: Advances one and returns its motor commands.
+        firmware: The struct of the constants common to all flight controllers.
+        motor_commands: Advances one flight controller by a physics step and returns its motor commands.
     """
 
     firmware: Any
@@ -30,7 +30,7 @@ class Kernels(NamedTuple):
 
 
 def arrays(rate_loop: RateLoop | None, like: Tensor) -> list[Any]:
-    """Return a rate loop's state and what differs between drones, as warp has them; two of one row if there is none."""
+    """Return a rate loop's state and per-drone parameters as warp arrays; two dummy arrays if there is none."""
     warp = load_warp()
     none = like.new_zeros(1, 1, 3)
     tensors = (none, none) if rate_loop is None else (rate_loop.state, rate_loop.own)
@@ -39,7 +39,7 @@ def arrays(rate_loop: RateLoop | None, like: Tensor) -> list[Any]:
 
 
 def fill(rate_loop: RateLoop | None, struct: Any) -> Any:
-    """Fill the kernels' struct; with nothing if there is no rate loop."""
+    """Return the filled struct of constants; an empty one if there is no rate loop."""
     firmware = struct()
     if rate_loop is None:
         return firmware
@@ -67,7 +67,7 @@ def fill(rate_loop: RateLoop | None, struct: Any) -> Any:
 
 @cache
 def make_kernels(dtype: torch.dtype) -> Kernels:
-    """Make the struct and the function of a floating-point type."""
+    """Make the struct and the function for a floating-point type."""
     wp = load_warp()
     real = wp.dtype_from_torch(dtype)
     vec3, vec4 = wp.types.vector(3, real), wp.types.vector(4, real)
@@ -75,7 +75,7 @@ def make_kernels(dtype: torch.dtype) -> Kernels:
     @wp.struct
     class Firmware:
         dt: real  # s
-        radian: real  # s, 2π of a step
+        radian: real  # s, 2π times the step
         thrust_max: real  # N
         idle: real
         throttle_way: real  # µs
@@ -110,7 +110,7 @@ def make_kernels(dtype: torch.dtype) -> Kernels:
         tpa_breakpoint: real
 
     @wp.func
-    def share(f: Firmware, cutoff: real):  # by which a low-pass moves in a step
+    def share(f: Firmware, cutoff: real):  # gain of a low-pass in a step
         omega = f.radian * cutoff
         return omega / (omega + real(1.0))
 
@@ -167,7 +167,7 @@ def make_kernels(dtype: torch.dtype) -> Kernels:
     @wp.func
     def filter_gyro(
         f: Firmware, i: int, rates: vec3, throttle: real, memory: wp.array2d(dtype=vec3), own: wp.array2d(dtype=vec3)
-    ):  # returns what P and I see, and by how much what D sees has fallen
+    ):  # returns the filtered rates for P and I, and the decrease of those for D
         filters = own[i, OWN_FILTERS]
         first = memory[i, GYRO_LPF2]
         first = first + share(f, f.gyro_lpf2 * filters[0]) * (real(DEGREES) * rates - first)
@@ -237,8 +237,8 @@ def make_kernels(dtype: torch.dtype) -> Kernels:
     return Kernels(Firmware, motor_commands)
 
 
-DEGREES = 57.29577951308232  # of a radian
-# rows of `Row` and `Own`, as warp's compiler takes them: plain numbers
+DEGREES = 57.29577951308232  # per radian
+# rows of `Row` and `Own` as plain integers, which warp's compiler needs
 SETPOINT, SETPOINT_SPEED, SETPOINT_MEAN = int(Row.SETPOINT), int(Row.SETPOINT_SPEED), int(Row.SETPOINT_MEAN)
 GYRO_LPF2, GYRO_LPF1 = int(Row.GYRO_LPF2), int(Row.GYRO_LPF1)
 DTERM_LPF1, DTERM_LPF2 = int(Row.DTERM_LPF1), int(Row.DTERM_LPF2)

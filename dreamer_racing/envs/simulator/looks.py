@@ -1,6 +1,6 @@
-"""How the hall looks to each drone, redrawn every episode: light, colours, camera tilt and lens, and the image's noise.
+"""Visual randomisation, drawn for each drone and episode: light, colours, camera tilt, field of view, and image noise.
 
-Randomised looks make a policy that transfers to another hall or camera. Widths are this project's choice.
+Randomised looks help a policy to transfer to another hall or camera. Widths are this project's choice.
 
 Shapes: N worlds, K materials of the scene, M frames.
 """
@@ -20,14 +20,14 @@ from dreamer_racing.settings import NOT_NEGATIVE, check_numbers
 
 @dataclass(frozen=True)
 class LooksRandomisation:
-    """Half-widths of the uniform, per-episode randomisation of looks; zero turns one off."""
+    """Half-widths of the uniform, per-episode randomisation of looks; zero disables one."""
 
     brightness: float = 0.3  # of the light, relative
-    color: float = 0.15  # of the red, green and blue of every surface, relative
-    gate_color: float = 0.15  # of red, green and blue of gates and decoys, added
+    color: float = 0.15  # of red, green and blue of all surfaces but gates and decoys, relative
+    gate_color: float = 0.15  # of red, green and blue of gates and decoys, additive
     camera_tilt: float = 3.0  # degrees
     field_of_view: float = 3.0  # degrees
-    noise: float = 0.02  # standard deviation of every pixel's noise, of full scale; drawn anew for every image
+    noise: float = 0.02  # standard deviation of the pixel noise of each image, relative to full scale
 
     def __post_init__(self) -> None:
         widths = vars(self)
@@ -41,7 +41,7 @@ class LooksRandomisation:
 
 @dataclass(frozen=True)
 class Looks:
-    """What M frames look like."""
+    """Looks of M frames."""
 
     colors: Tensor  # (M, K, 3) red, green, blue of each material, times the light
     camera_tilt: Tensor  # (M,) degrees upwards
@@ -53,22 +53,22 @@ class Looks:
 
 
 class LooksSampler:
-    """Keeps the looks of N worlds, in tensors that stay in place.
+    """Samples and holds the looks of N worlds, in tensors that are updated in place.
 
     Args:
-        randomisation: how far they vary.
-        scene: the compiled scene, as `build_scene` makes it.
+        randomisation: the widths of the randomisation.
+        scene: the compiled scene of `build_scene`.
         camera: the nose camera.
         num_envs: N.
-        device: where the looks live.
+        device: device of the looks.
         dtype: floating-point type of angles and colours.
         generator: source of randomness, on the device.
 
     Attributes:
-        looks: those of the present episodes, (N, ...); nominal until `reset`.
+        looks: the looks of the current episodes, (N, ...); nominal until `reset`.
 
     Raises:
-        ValueError: lenses vary further than there are any.
+        ValueError: the field of view could leave the range from 0 to 180 degrees.
     """
 
     def __init__(
@@ -102,7 +102,7 @@ class LooksSampler:
         )
 
     def reset(self, mask: Tensor) -> None:
-        """Draw the looks of the masked worlds (N,) bool."""
+        """Draw new looks for the masked worlds (N,) bool."""
         widths, looks = self._randomisation, self.looks
         noise = self._uniform(*looks.colors.shape)
         surfaces = (self._nominal * (1.0 + self._relative * noise) + self._added * noise).clamp(0.0, 1.0)
@@ -114,7 +114,7 @@ class LooksSampler:
         looks.field_of_view.copy_(torch.where(mask, field_of_view, looks.field_of_view))
 
     def add_noise(self, images: Tensor) -> Tensor:
-        """Return images uint8 (M, height, width, 3) with noise of their own."""
+        """Return images uint8 (M, height, width, 3) with new noise."""
         if self._randomisation.noise == 0.0:
             return images
         noise = torch.empty(images.shape, device=images.device).normal_(generator=self._generator)
@@ -127,7 +127,7 @@ class LooksSampler:
         return 2.0 * torch.rand(shape, generator=self._generator, device=like.device, dtype=like.dtype) - 1.0
 
     def state_dict(self) -> dict[str, Tensor]:
-        """Return the looks of the present episodes."""
+        """Return the looks of the current episodes."""
         return {field.name: getattr(self.looks, field.name).clone() for field in fields(Looks)}
 
     def load_state_dict(self, state_dict: Mapping[str, Tensor]) -> None:
@@ -137,7 +137,7 @@ class LooksSampler:
 
 
 def load_looks(looks: str | LooksRandomisation | None) -> LooksRandomisation | None:
-    """Return the randomisation of a name: `nominal` is none, `randomised` the default one.
+    """Return the randomisation of a name: None for `nominal`, the default one for `randomised`.
 
     Raises:
         ValueError: unknown name.

@@ -1,4 +1,4 @@
-"""N worlds on CPU: MuJoCo's C engine for the rigid bodies, batched natively, and a renderer for their cameras."""
+"""N worlds on CPU: MuJoCo's C engine with native batching for the rigid bodies, and a renderer for their cameras."""
 
 import ctypes
 import os
@@ -21,9 +21,9 @@ _batches: weakref.WeakSet[Batch] = weakref.WeakSet()
 
 
 def _keep_batches() -> None:
-    """Keep those of before a fork from being freed: they would wait for threads, which a forked process does not have.
+    """In a forked process, keep the parent's batches from being freed, which would wait for threads that do not exist.
 
-    A list of them would be freed when that process exits.
+    A list of references would itself be freed at exit, so the reference counts are incremented.
     """
     for batch in _batches:
         ctypes.pythonapi.Py_IncRef(ctypes.py_object(batch))
@@ -34,17 +34,17 @@ if hasattr(os, "register_at_fork"):
 
 
 class MujocoSimulator(Simulator):
-    """MuJoCo's C engine, in float64.
+    """Simulator with MuJoCo's C engine, in float64.
 
     Args:
-        track: what stands in the hall.
+        track: the track.
         parameters: the drone.
         num_envs: N worlds.
         camera: the nose camera.
-        renderer: as `make_renderer` takes it, or None for no images.
+        renderer: a name that `make_renderer` takes, or None for no images.
         num_threads: physics and rendering threads; `usable_threads` if None.
         generator: source of the randomisation of physics and looks.
-        looks: how far looks vary; None for the same in every episode.
+        looks: randomisation of looks; None for the same in every episode.
 
     Example:
         >>> from dreamer_racing.envs.tracks import load_track
@@ -68,7 +68,7 @@ class MujocoSimulator(Simulator):
             raise ValueError(f"num_threads={num_threads}: must be at least 1.")
         num_threads = min(num_threads or usable_threads(), num_envs)
         model = build_drone(parameters).compile()
-        # a broken state must be seen and ended by the race, not hidden by an automatic reset
+        # the race must detect a non-finite state and end the episode; an automatic reset would hide it
         model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_AUTORESET
         batch = Batch(model, num_envs, num_threads)
         _batches.add(batch)
@@ -84,7 +84,7 @@ class MujocoSimulator(Simulator):
                 self.looks = LooksSampler(looks, scene, camera, num_envs, self.device, self.dtype, generator)
 
     def render(self, rows: Tensor | None = None) -> Tensor:
-        """Images uint8 (M, height, width, 3) of all worlds, or of M rows: a mask (N,) bool, or numbers (M,)."""
+        """Return images uint8 (M, height, width, 3) of all worlds, or of M rows: a mask (N,) bool, or indices (M,)."""
         if self.renderer is None:
             raise no_images(self._closed)
         return self.renderer.render(*self._frames(rows))

@@ -1,4 +1,4 @@
-"""N worlds on a CUDA device: `mujoco_warp` for the rigid bodies and for their cameras."""
+"""N worlds on a CUDA device: `mujoco_warp` for the rigid bodies and the cameras."""
 
 import dataclasses
 from collections.abc import Callable
@@ -20,22 +20,22 @@ from dreamer_racing.machine import GB, available_memory
 
 
 class WarpSimulator(Simulator):
-    """`mujoco_warp`'s physics, in float32, and its ray caster. It also runs on CPU, slowly: for tests.
+    """Simulator with `mujoco_warp`'s physics, in float32, and its ray caster. On CPU it is slow, for tests only.
 
-    Neither a step nor drawing all worlds waits for the device.
+    Neither a step nor rendering all worlds synchronises with the device.
 
     Args:
-        track: what stands in the hall.
+        track: the track.
         parameters: the drone.
         num_envs: N worlds.
         camera: the nose camera.
-        images: whether there are any.
+        images: whether to render images.
         device: torch's name of the device.
         generator: source of the randomisation of physics and looks, on the device.
-        looks: how far looks vary; None for the same in every episode.
+        looks: randomisation of looks; None for the same in every episode.
 
     Raises:
-        ValueError: the device has not the memory for so many worlds.
+        ValueError: the device does not have enough memory for so many worlds.
 
     Example:
         >>> from dreamer_racing.envs.tracks import load_track
@@ -71,7 +71,7 @@ class WarpSimulator(Simulator):
                 self.looks = LooksSampler(looks, scene, self._camera, num_envs, device, self.dtype, generator)
 
     def render(self, rows: Tensor | None = None) -> Tensor:
-        """Images uint8 (M, height, width, 3) of all worlds, or of M rows: a mask (N,) bool, or numbers (M,)."""
+        """Return images uint8 (M, height, width, 3) of all worlds, or of M rows: a mask (N,) bool, or indices (M,)."""
         if self._ray_caster is None:
             raise no_images(self._closed)
         position, attitude, looks = self._frames(rows)
@@ -90,7 +90,7 @@ class WarpSimulator(Simulator):
 def _make_bodies(
     parameters: QuadrotorParameters, num_envs: int, device: torch.device
 ) -> tuple[Any, Callable[[], None]]:
-    """Make N drones in empty worlds; return their data and the function that moves them by one physics step."""
+    """Make N drones in empty worlds; return their data and a function that makes one physics step."""
     load_warp()
     import mujoco_warp
 
@@ -115,7 +115,7 @@ def _check_memory(needed: int, num_envs: int, device: torch.device) -> None:
 
 
 def _make_data(model: mujoco.MjModel, num_worlds: int) -> Any:
-    """Make the data of worlds without contacts and constraints: with room for one, MuJoCo would run its solver."""
+    """Make the data of worlds without room for contacts or constraints, so that MuJoCo does not run its solver."""
     import mujoco_warp
 
     return mujoco_warp.make_data(model, nworld=num_worlds, nconmax=0, njmax=0)
@@ -124,26 +124,26 @@ def _make_data(model: mujoco.MjModel, num_worlds: int) -> Any:
 def memory_of_worlds(
     track: Track, parameters: QuadrotorParameters, num_envs: int, camera: Camera | None = None, images: bool = True
 ) -> int:
-    """Estimate the device memory that a `WarpSimulator` and one observation of its N worlds take, in bytes.
+    """Estimate the device memory of a `WarpSimulator` and one observation of its N worlds, in bytes.
 
-    Counts the arrays of one world; the nodes of the bounding volumes, which warp does not show, are taken for 64 bytes,
-    two a geom.
+    It adds up the arrays of one world. The nodes of the bounding volumes, which warp does not expose, are assumed to
+    be two per geom, of 64 bytes.
     """
     models = [build_drone(parameters).compile()]
-    per_world = 4 * 3 * (parameters.physics_steps + 1)  # the path
+    per_world = 4 * 3 * (parameters.physics_steps + 1)  # positions of all physics steps
     if images:
         camera = camera or Camera()
         hall = build_scene(track, parameters, camera).compile()
         models.append(hall)
         pixels = camera.width * camera.height
-        per_world += pixels * (4 + 2 * 3) + hall.ngeom * (28 + 2 * 64)  # packed; drawn and copied; bounding volumes
+        per_world += pixels * (4 + 2 * 3) + hall.ngeom * (28 + 2 * 64)  # packed; rendered and copied; bounding volumes
     with scope(torch.device("cpu")):
         per_world += sum(_array_bytes(_make_data(model, 2)) - _array_bytes(_make_data(model, 1)) for model in models)
     return per_world * num_envs
 
 
 def _array_bytes(data: Any) -> int:
-    """Bytes of all warp arrays of a (nested) dataclass."""
+    """Return the bytes of all warp arrays of a (nested) dataclass."""
     total = 0
     for field in dataclasses.fields(data):
         value = getattr(data, field.name)

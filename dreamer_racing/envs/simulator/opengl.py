@@ -1,6 +1,6 @@
-"""MuJoCo's OpenGL renderer as this project uses it: one scene that stands still, seen by a camera that is put anywhere.
+"""MuJoCo's OpenGL renderer for a static scene and a freely placed camera.
 
-No torch in here: whoever flies an exported actor draws with this too (`dreamer_racing.hil`).
+No torch here: flight with an exported actor renders with this too (`dreamer_racing.hil`).
 """
 
 import atexit
@@ -18,15 +18,15 @@ from dreamer_racing.envs.simulator.scene import CAMERA_NAME, HALL_GROUP, Camera
 
 MAX_GEOMS = 1000  # capacity of MuJoCo's list of visible geoms
 GL_LIBRARIES = {"egl": ("libEGL.so.1", "libEGL.so"), "osmesa": ("libOSMesa.so.8", "libOSMesa.so.6", "libOSMesa.so")}
-_open_contexts: set[Any] = set()  # a thread that is not a context's own must not collect it
+_open_contexts: set[Any] = set()  # keeps contexts from being collected in another thread than their own
 
 
 class RendererUnavailableError(RuntimeError):
-    """No image can be drawn this way on this machine; the message says why and what would help."""
+    """A renderer does not work on this machine; the message says why and how to fix it."""
 
 
 class OpenGLScene:
-    """A compiled scene in an OpenGL context of its own; to be used in the thread that made it.
+    """A compiled scene in its own OpenGL context; must be used in the thread that made it.
 
     Args:
         backend: `egl` or `osmesa`.
@@ -50,29 +50,29 @@ class OpenGLScene:
         data = mujoco.MjData(model)
         mujoco.mj_forward(model, data)
         self.show(model, data, HALL_GROUP)
-        self._eyes = tuple(self._scene.camera)  # MuJoCo draws from the mean of its two stereo eyes
+        self._eyes = tuple(self._scene.camera)  # MuJoCo renders from the mean of its two stereo eyes
         self._buffer = np.empty((camera.height, camera.width, 3), np.uint8)
         self._upright = self._buffer[::-1]  # OpenGL's first row is the lowest
 
     def show(self, model: mujoco.MjModel, data: mujoco.MjData, *groups: int) -> None:
-        """Put the geoms of these groups into the scene, where the data have them."""
+        """Update the scene with the geoms of these groups, at their poses in the data."""
         option = mujoco.MjvOption()
         option.geomgroup[:] = 0
         option.geomgroup[list(groups)] = 1
-        option.sitegroup[:] = 0  # the drone's site would stay behind as a ball in mid-air
+        option.sitegroup[:] = 0  # the drone's site would remain visible as a ball in mid-air
         view = mujoco.MjvCamera()
         view.type = mujoco.mjtCamera.mjCAMERA_FIXED
         view.fixedcamid = model.camera(CAMERA_NAME).id
         mujoco.mjv_updateScene(model, data, option, mujoco.MjvPerturb(), view, mujoco.mjtCatBit.mjCAT_ALL, self._scene)
 
     def draw(self, position: np.ndarray, up: np.ndarray, forward: np.ndarray, out: np.ndarray) -> None:
-        """Draw what a camera sees.
+        """Render the scene from a camera pose.
 
         Args:
-            position: of the camera, (3,) m.
+            position: position of the camera, (3,) m.
             up: the camera's up direction in the world, (3,).
-            forward: the direction in which it looks, (3,).
-            out: takes the image, uint8 RGB (height, width, 3), first row at the top.
+            forward: its viewing direction in the world, (3,).
+            out: receives the image, uint8 RGB (height, width, 3), first row at the top.
         """
         for eye in self._eyes:
             eye.pos, eye.up, eye.forward = position, up, forward
@@ -81,7 +81,7 @@ class OpenGLScene:
         out[:] = self._upright
 
     def dress(self, colors: np.ndarray, field_of_view: float) -> None:
-        """Give the scene's materials their colours (K, 3), and the camera its vertical field of view, degrees."""
+        """Set the colours of the scene's materials (K, 3), and the camera's vertical field of view, degrees."""
         for geom in self._scene.geoms[: self._scene.ngeom]:
             geom.rgba[:3] = colors[geom.matid]
         for eye in self._eyes:
@@ -96,24 +96,24 @@ class OpenGLScene:
 
 
 def open_scene(backend: str, model: mujoco.MjModel, camera: Camera) -> OpenGLScene:
-    """Make a scene.
+    """Make an `OpenGLScene`.
 
     Raises:
         RendererUnavailableError: OpenGL did not start; the message says why.
     """
-    # llvmpipe, Mesa's software rasteriser, must not start threads of its own beside ours
+    # llvmpipe, Mesa's software rasteriser, must not start additional threads
     os.environ.setdefault("LP_NUM_THREADS", "0")
     try:
         return OpenGLScene(backend, model, camera)
-    except Exception as error:  # PyOpenGL raises anything from AttributeError to its own GLError
+    except Exception as error:  # PyOpenGL raises anything from AttributeError to GLError
         reason = f"{backend} did not start ({type(error).__name__}: {error}){in_the_way(backend)}."
         raise RendererUnavailableError(reason) from error
 
 
 def keep_display(backend: str) -> None:
-    """Leave EGL's display to the end of the process, where MuJoCo and dm_control, which share it, terminate it at exit.
+    """Unregister the exit hook that terminates EGL's display, which MuJoCo and dm_control share.
 
-    The contexts of whichever of the two outlives the other's hook would print tracebacks then.
+    If one library's hook ran while contexts of the other still existed, they would print tracebacks.
     """
     if backend == "egl":
         atexit.unregister(importlib.import_module("OpenGL.EGL").eglTerminate)
@@ -121,13 +121,13 @@ def keep_display(backend: str) -> None:
 
 @atexit.register
 def _leave_contexts() -> None:
-    """Leave contexts to it too: dm_control, imported after the last of them was made, has terminated the display."""
+    """Abandon open contexts at exit: dm_control's hook may have been registered later and terminated the display."""
     for context in _open_contexts:
         context._context = None
 
 
 def loads(library: str) -> bool:
-    """Whether a shared library, named as the loader finds it, is installed."""
+    """Return whether a shared library can be loaded."""
     try:
         ctypes.CDLL(library)
     except OSError:
@@ -136,7 +136,7 @@ def loads(library: str) -> bool:
 
 
 def require_library(backend: str) -> None:
-    """Refuse a back end whose library is not installed.
+    """Refuse a backend whose library is not installed.
 
     Raises:
         RendererUnavailableError: the message says how to install it.

@@ -1,4 +1,4 @@
-"""`mujoco_warp`'s batch renderer: on a CUDA device thousands of cameras in one launch, on CPU without OpenGL."""
+"""`mujoco_warp`'s batch renderer: thousands of cameras in one launch on a CUDA device; on CPU, needs no OpenGL."""
 
 import copy
 
@@ -12,14 +12,14 @@ from dreamer_racing.envs.simulator.warp_device import load_warp, scope
 
 
 class RayCaster:
-    """Draws a hall that stands still, so that its bounding volumes are built once, from many cameras at a time.
+    """Renders a static hall from many cameras at a time; the bounding volumes are built only once.
 
     Args:
         model: the compiled scene.
         camera: the nose camera.
-        frames: the most frames drawn in one launch.
+        frames: maximum number of frames per launch.
         device: torch's name of the device.
-        varied_looks: whether frames may have looks of their own.
+        varied_looks: whether looks may differ between frames.
     """
 
     def __init__(
@@ -61,14 +61,14 @@ class RayCaster:
         self._pixels = packed.unflatten(-1, (camera.height, camera.width, 4))[..., :3]
 
     def _vary(self, frames: int) -> tuple[Tensor, Tensor]:
-        """Give every frame materials and a camera of its own; return views of colours and fields of view."""
+        """Allocate separate materials and cameras for every frame; return views of colours and fields of view."""
         warp, model = load_warp(), self._model
         model.mat_rgba = warp.from_torch(warp.to_torch(model.mat_rgba)[:1].repeat(frames, 1, 1), dtype=warp.vec4)
         model.cam_fovy = warp.from_torch(warp.to_torch(model.cam_fovy)[:1].repeat(frames, 1))
         return warp.to_torch(model.mat_rgba)[..., :3], warp.to_torch(model.cam_fovy)[:, 0]
 
     def draw(self, position: Tensor, axes: Tensor, out: Tensor, looks: Looks | None = None) -> None:
-        """Draw from camera positions (m, 3) and axes (m, 3, 3; rows right, up, backwards) into out (m, H, W, 3)."""
+        """Render from camera positions (m, 3) and axes (m, 3, 3; rows right, up, backwards) into out (m, H, W, 3)."""
         capacity = len(self._position)
         for start in range(0, len(position), capacity):
             part = slice(start, start + capacity)
@@ -84,11 +84,11 @@ class RayCaster:
             out[part] = self._pixels[:frames]
 
     def close(self) -> None:
-        """Nothing to free: warp's arrays go with the object."""
+        """Do nothing: warp's arrays are freed with the object."""
 
 
 def _blue_first(model: mujoco.MjModel) -> mujoco.MjModel:
-    """Swap red and blue of all colours: the renderer packs pixels as bytes B, G, R, A, and so red comes first."""
+    """Swap red and blue of all colours: the renderer packs pixels as bytes B, G, R, A, so the result is R, G, B."""
     swapped = copy.copy(model)
     surfaces, lights = (swapped.geom_rgba, swapped.mat_rgba), (swapped.light_ambient, swapped.light_diffuse)
     for colors in (*surfaces, *lights, swapped.light_specular):

@@ -1,17 +1,17 @@
-"""Nose-camera images of M drones on CPU: K threads, each with a worker and a slice of the frames.
+"""Rendering of M drones' nose cameras for the CPU simulator: K threads, each with a worker and a slice of the frames.
 
-Only the camera moves: hall and gates stand still and the drone is hidden from its own camera. So a worker prepares the
-scene once, and per frame only places the camera and draws.
+Only the camera moves: hall and gates are static, and the drone is hidden from its own camera. So a worker prepares the
+scene once, and for each frame only moves the camera and renders.
 
 Workers, in the order in which `renderer="auto"` tries them:
 
-| name | needs | how |
+| name | needs | method |
 |---|---|---|
-| `egl` | an EGL library (Mesa in software will do) | MuJoCo's OpenGL renderer |
+| `egl` | an EGL library (Mesa's software renderer suffices) | MuJoCo's OpenGL renderer |
 | `osmesa` | OSMesa | the same, slower |
 | `warp` | nothing | `mujoco_warp`'s ray caster, compiled for the CPU |
 
-`warp_cuda`, which `auto` does not try, casts the rays on a CUDA device in one launch: poses go there, images come back.
+`warp_cuda`, which `auto` does not try, casts the rays on a CUDA device in one launch and copies the images back.
 
 Shapes: M frames. Images are uint8 RGB (M, height, width, 3), first row at the top.
 """
@@ -49,15 +49,15 @@ T = TypeVar("T")
 RENDERERS = ("egl", "osmesa", "warp")
 HYBRID = "warp_cuda"
 EXIT_PATIENCE = 10.0
-"""How long the end of the process waits for a frame that is being drawn, s [choice]."""
+"""Maximum time for which the exit of the process waits for a frame that is being rendered, s [choice]."""
 
 
 class NoseMount:
-    """Where the cameras of drones are.
+    """Computes the camera poses of drones.
 
     Args:
         camera: the nose camera.
-        device: where poses will be.
+        device: device of the poses.
         dtype: floating-point type of the poses.
     """
 
@@ -66,15 +66,15 @@ class NoseMount:
         self._tilt = torch.tensor([camera.tilt], device=device, dtype=dtype)
 
     def __call__(self, position: Tensor, attitude: Tensor, tilt: Tensor | None = None) -> tuple[Tensor, Tensor]:
-        """Place the cameras.
+        """Return the camera poses.
 
         Args:
-            position: of the drones, (M, 3), m.
-            attitude: of the drones, (M, 4) wxyz.
-            tilt: of the cameras, (M,), degrees upwards; the camera's own if None.
+            position: positions of the drones, (M, 3), m.
+            attitude: attitudes of the drones, (M, 4) wxyz.
+            tilt: tilts of the cameras, (M,), degrees upwards; the camera's own if None.
 
         Returns:
-            Eyes (M, 3), and axes (M, 3, 3) with rows right, up, backwards, in the world.
+            Camera positions (M, 3), and axes (M, 3, 3) with rows right, up, backwards, in the world.
         """
         angle = torch.deg2rad(self._tilt if tilt is None else tilt)
         cosine, sine, zero = angle.cos(), angle.sin(), torch.zeros_like(angle)
@@ -86,28 +86,28 @@ class NoseMount:
 
 
 class Worker(Protocol):
-    """Draws frames in one thread."""
+    """Renders frames in one thread."""
 
     def draw(self, position: Tensor, axes: Tensor, out: Tensor, looks: Looks | None = None) -> None:
-        """Draw from camera positions (m, 3) and axes (m, 3, 3; rows right, up, backwards) into out (m, H, W, 3).
+        """Render from camera positions (m, 3) and axes (m, 3, 3; rows right, up, backwards) into out (m, H, W, 3).
 
-        Frames that have looks take the colours of their materials and the field of view from them; the axes are tilted
-        as they say already, and the noise comes later.
+        Material colours and field of view are taken from ``looks``, if given. Its camera tilt is already in ``axes``,
+        and noise is added later.
         """
         ...
 
     def close(self) -> None:
-        """Free what the worker holds; called in its own thread."""
+        """Free the worker's resources; called in its own thread."""
         ...
 
 
 class RenderThread(Thread):
-    """A thread that does what it is given, in order, until it is ended.
+    """A thread that runs submitted functions in order until it is ended.
 
-    Unlike an executor's, `end` takes no lock that could be held already: the garbage collector may call it anywhere.
+    Unlike an executor's shutdown, `end` takes no lock that may be held already, so the garbage collector may call it.
 
     Args:
-        name: of the thread.
+        name: name of the thread.
     """
 
     def __init__(self, name: str) -> None:
@@ -116,7 +116,7 @@ class RenderThread(Thread):
         self.start()
 
     def submit(self, function: Callable[..., T], *arguments: Any) -> Future[T]:
-        """Have a function called, and return what will have its result.
+        """Queue a function call and return the future of its result.
 
         Raises:
             RuntimeError: the thread has ended, as all do when the interpreter exits.
@@ -128,22 +128,22 @@ class RenderThread(Thread):
         return future
 
     def end(self, last: Callable[[], None] | None) -> None:
-        """End the thread once all is done, with a last function if there is one; does not wait for that."""
+        """End the thread after all queued calls and an optional last one; return without waiting."""
         if last is not None:
             self._tasks.put(Task(None, last, ()))
         self._tasks.put(None)
 
     def run(self) -> None:
-        """Do what comes."""
+        """Run the queued calls until the thread is ended."""
         while (task := self._tasks.get()) is not None:
             _do(task)
-            del task  # or the next wait would keep what it refers to
+            del task  # or it would keep its arguments alive while waiting for the next task
 
 
 class Task(NamedTuple):
-    """Something to do in a thread."""
+    """A function call queued in a `RenderThread`."""
 
-    future: Future[Any] | None  # takes what it returns or raises; None: nobody waits
+    future: Future[Any] | None  # receives the result or exception; None if nobody waits for it
     function: Callable[..., Any]
     arguments: tuple[Any, ...]
 
@@ -163,10 +163,10 @@ def _do(task: Task) -> None:
 
 @atexit.register
 def _end_all() -> None:
-    """End the threads while the interpreter still works.
+    """End the threads before the interpreter shuts down.
 
-    It ends a thread that asks for its lock later on the spot, and where that is amid C++, as when a tensor is let go,
-    the process aborts.
+    During shutdown, a thread that requests the GIL is killed at once; inside C++ code, as when a tensor is freed, that
+    aborts the process.
     """
     threads = [thread for thread in enumerate_threads() if isinstance(thread, RenderThread)]
     for thread in threads:
@@ -176,12 +176,12 @@ def _end_all() -> None:
 
 
 class Renderer:
-    """Spreads frames over workers, each of which lives in a thread of its own.
+    """Distributes frames over workers, each with its own thread.
 
-    One that is let go without `close` frees its workers too, without waiting for it.
+    A renderer that is garbage-collected without `close` frees its workers too, without waiting.
 
     Args:
-        name: out of `RENDERERS`, or `HYBRID`.
+        name: a name from `RENDERERS`, or `HYBRID`.
         make_worker: makes one worker; called once in each thread.
         camera: the nose camera.
         num_workers: K.
@@ -193,9 +193,9 @@ class Renderer:
         self._threads = [RenderThread(f"render_{index}") for index in range(num_workers)]
         self._workers: list[Worker] = []
         self._end = weakref.finalize(self, _end, self._threads, self._workers)
-        self._end.atexit = False  # contexts are freed at exit as it is
+        self._end.atexit = False  # contexts are freed at exit anyway
         try:
-            # one after the other: the first GL context of a process initialises the display
+            # sequentially, because the first GL context of a process initialises the display
             for thread in self._threads:
                 self._workers.append(thread.submit(make_worker).result())
         except BaseException:
@@ -204,7 +204,7 @@ class Renderer:
         self._mount = NoseMount(camera)
 
     def render(self, position: Tensor, attitude: Tensor, looks: Looks | None = None) -> Tensor:
-        """Images (M, height, width, 3) of drones at positions (M, 3) with attitudes (M, 4), wxyz."""
+        """Return images (M, height, width, 3) of drones at positions (M, 3) with attitudes (M, 4), wxyz."""
         assert self._end.alive, "the renderer is closed"
         camera = self.camera
         frames = len(position)
@@ -221,22 +221,22 @@ class Renderer:
         return images
 
     def close(self) -> None:
-        """Free every worker in its own thread, and wait for the threads' end."""
-        if self._end.detach() is not None:  # once; called, it does nothing while the interpreter exits
+        """Free every worker in its own thread, and join the threads."""
+        if self._end.detach() is not None:  # only once; a finalizer does nothing if called during interpreter exit
             _end(self._threads, self._workers)
         for thread in self._threads:
             thread.join()
 
 
 def _end(threads: list[RenderThread], workers: list[Worker]) -> None:
-    """Free workers, of which there may be fewer, and end the threads."""
+    """Free the workers, which may be fewer than the threads, and end the threads."""
     for thread, worker in zip_longest(threads, workers):
         thread.end(None if worker is None else worker.close)
     workers.clear()
 
 
 class OpenGLWorker:
-    """MuJoCo's OpenGL renderer.
+    """Worker with MuJoCo's OpenGL renderer.
 
     Args:
         backend: `egl` or `osmesa`.
@@ -251,7 +251,7 @@ class OpenGLWorker:
         self._scene = open_scene(backend, model, camera)
 
     def draw(self, position: Tensor, axes: Tensor, out: Tensor, looks: Looks | None = None) -> None:
-        """Draw from camera positions (m, 3) and axes (m, 3, 3; rows right, up, backwards) into out (m, H, W, 3)."""
+        """Render from camera positions (m, 3) and axes (m, 3, 3; rows right, up, backwards) into out (m, H, W, 3)."""
         positions, ups, forwards = position.numpy(), axes[:, 1].numpy(), (-axes[:, 2]).numpy()
         images = out.numpy()
         for index in range(len(images)):
@@ -267,19 +267,19 @@ class OpenGLWorker:
 def make_renderer(
     name: str, model: mujoco.MjModel, camera: Camera, num_envs: int, num_workers: int, varied_looks: bool = False
 ) -> Renderer:
-    """Make the renderer of that name, or the first that works for `auto`; log which and why.
+    """Make a renderer by name, or the first that works for `auto`; log which one and why.
 
     Args:
-        name: `auto`, or a name out of `RENDERERS`, or `HYBRID`.
+        name: `auto`, or a name from `RENDERERS`, or `HYBRID`.
         model: the compiled scene.
         camera: the nose camera.
-        num_envs: the most frames drawn at once.
-        num_workers: threads.
-        varied_looks: whether frames may have looks of their own.
+        num_envs: maximum number of frames per call.
+        num_workers: number of threads.
+        varied_looks: whether looks may differ between frames.
 
     Raises:
         ValueError: unknown name.
-        RendererUnavailableError: the renderer asked for does not work here.
+        RendererUnavailableError: the chosen renderer does not work here.
     """
     if name not in ("auto", *RENDERERS, HYBRID):
         known = ", ".join(("auto", *RENDERERS, HYBRID))
@@ -295,7 +295,7 @@ def make_renderer(
             reasons.append(str(error))
             continue
         why = f"; {' '.join(reasons)}" if reasons else ""
-        level = logging.WARNING if reasons else logging.INFO  # it is slower than what is missing
+        level = logging.WARNING if reasons else logging.INFO  # a fallback is slower
         say_once(level, f"renderer: {candidate}, {num_workers} thread(s){why}")
         return renderer
     raise RendererUnavailableError(" ".join(reasons))
@@ -303,14 +303,14 @@ def make_renderer(
 
 @cache
 def say_once(level: int, words: str) -> None:
-    """Log what a process need not hear again of its next worlds: those of evaluations, say."""
+    """Log a message once per process, not again for each further simulator."""
     logger.log(level, words)
 
 
 def _worker_factory(
     name: str, model: mujoco.MjModel, camera: Camera, frames: int, varied_looks: bool
 ) -> Callable[[], Worker]:
-    """Return what makes the workers of a renderer, once it is sure that they can work here."""
+    """Return the factory of a renderer's workers, after checking that they can work here."""
     if name in GL_LIBRARIES:
         require_library(name)
         return lambda: OpenGLWorker(name, model, camera)

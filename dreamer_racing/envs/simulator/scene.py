@@ -1,9 +1,9 @@
-"""The one scene that every backend compiles: the hall, the gates, the drone and its nose camera, as an `MjSpec`.
+"""The scene that every backend compiles: the hall, the gates, the drone and its nose camera, as an `MjSpec`.
 
-`build_drone` is the part that moves: simulators step it alone, in a third less time than with the hall around it. The
-scene is drawn in flat colours without shadows, reflections or fine textures: at 64×64 pixels those alias, and
-MuJoCo's OpenGL renderer and `mujoco_warp`'s ray caster must agree. Contacts are off: `envs.race.gates` decides crashes.
-Dimensions of the hall, colours and the camera's mount are this project's choice.
+`build_drone` is the moving part: simulators step it alone, in a third less time than with the hall. The scene has flat
+colours without shadows, reflections or fine textures: at 64×64 pixels those alias, and MuJoCo's OpenGL renderer and
+`mujoco_warp`'s ray caster must agree. Contacts are off: `envs.race.gates` detects crashes. Dimensions of the hall,
+colours and the camera's mount are this project's choice.
 """
 
 import math
@@ -51,13 +51,13 @@ class Camera:
         field_of_view: vertical, degrees, below 180.
         tilt: upwards, degrees; a racing drone pitches forward when it accelerates.
         position: mount in the body frame, m.
-        near: what is nearer is not drawn, m.
-        far: what is farther is not drawn, m.
-        rate: frames a second, Hz, a whole number of control steps each, see `frame_interval`; if None, one at every
-            control step.
+        near: distance of the near clipping plane, m.
+        far: distance of the far clipping plane, m.
+        rate: frames per second, Hz, with a whole number of control steps per frame, see `frame_interval`; None for one
+            frame per control step.
 
     Raises:
-        ValueError: the message gives the number, and what is allowed.
+        ValueError: the message gives the value, and what is allowed.
     """
 
     width: int = setting(64, COUNT)
@@ -81,10 +81,10 @@ class Camera:
 
 
 def load_camera(camera: Camera | None, rate: float | None = None, from_pixels: bool = True) -> Camera:
-    """Return the camera, the default one if None, with another rate of frames, Hz, where one is given.
+    """Return the camera, the default one if None, with the frame rate in Hz if one is given.
 
     Raises:
-        ValueError: it is none, or has no such rate, or there is one and nobody sees images.
+        ValueError: ``camera`` is not a `Camera`, the rate is invalid, or a rate is given without images.
     """
     if not (camera is None or isinstance(camera, Camera)):
         raise ValueError(f"camera={quoted(camera)}: must be a Camera, for instance Camera(tilt=25).")
@@ -98,10 +98,10 @@ def load_camera(camera: Camera | None, rate: float | None = None, from_pixels: b
 
 
 def frame_interval(camera: Camera, control_rate: float) -> int:
-    """Return the control steps from one frame of a camera to the next, where control runs at a rate, Hz.
+    """Return the control steps from one camera frame to the next, at a control rate in Hz.
 
     Raises:
-        ValueError: a frame would fall between two control steps; the message names the nearest rates that do not.
+        ValueError: a frame would fall between two control steps; the message names the nearest valid rates.
 
     Example:
         >>> frame_interval(Camera(rate=25), control_rate=100)
@@ -125,26 +125,26 @@ def frame_interval(camera: Camera, control_rate: float) -> int:
 
 
 def build_drone(parameters: QuadrotorParameters) -> mujoco.MjSpec:
-    """Build the drone in an empty world: all that physics needs.
+    """Build the drone in an empty world, which is all that the physics needs.
 
     Args:
         parameters: mass, inertia, physics step and integrator.
 
     Returns:
-        The specification: one free body `drone`, moved by gravity and by `qfrc_applied`, whose six numbers are a force
-        at its centre of mass in the world frame, N, and a torque in the body frame, N m.
+        The specification: one free body `drone`, driven by gravity and `qfrc_applied`: a force at its centre of mass in
+        the world frame, N, and a torque in the body frame, N m.
     """
     spec = mujoco.MjSpec()
     spec.modelname = "drone"
     spec.option.timestep = parameters.physics_dt
     spec.option.integrator = getattr(mujoco.mjtIntegrator, f"mjINT_{parameters.integrator.upper()}")
     spec.option.gravity = (0.0, 0.0, -GRAVITY)
-    disable = mujoco.mjtDisableBit  # what there is none of: contacts, constraints, damped joints
+    disable = mujoco.mjtDisableBit  # not used: contacts, constraints, damped joints
     spec.option.disableflags = disable.mjDSBL_CONTACT | disable.mjDSBL_CONSTRAINT | disable.mjDSBL_EULERDAMP
     drone = spec.worldbody.add_body(name="drone", pos=(0, 0, 1))
     drone.add_freejoint(name="drone")
     drone.mass, drone.inertia, drone.explicitinertial = parameters.mass, parameters.inertia, True
-    drone.ipos = (0.0, 0.0, 0.0)  # centre of mass; left alone, MjSpec takes the body's place in the world for it
+    drone.ipos = (0.0, 0.0, 0.0)  # centre of mass; by default MjSpec takes the body's position in the world
     return spec
 
 
@@ -153,7 +153,7 @@ def build_scene(track: Track, parameters: QuadrotorParameters, camera: Camera | 
 
     Args:
         track: gates, decoys and the bounding box, whose sides are the walls of the hall.
-        parameters: the drone's; see `build_drone`.
+        parameters: the drone; see `build_drone`.
         camera: the nose camera; the default one if None.
 
     Returns:
@@ -166,7 +166,7 @@ def build_scene(track: Track, parameters: QuadrotorParameters, camera: Camera | 
     spec.stat.center = (0.0, 0.0, 1.0)
     spec.visual.map.znear, spec.visual.map.zfar = camera.near, camera.far
     spec.visual.quality.shadowsize, spec.visual.quality.offsamples = 0, 0
-    spec.visual.quality.numquads = 1  # flat colours need no finer sides, which take a third of a frame's time
+    spec.visual.quality.numquads = 1  # flat colours need no more; the default takes a third of a frame's time
     spec.visual.global_.offwidth, spec.visual.global_.offheight = camera.width, camera.height
     _add_light(spec)
     _add_hall(spec, track)
@@ -180,7 +180,7 @@ def build_scene(track: Track, parameters: QuadrotorParameters, camera: Camera | 
 
 
 def _add_light(spec: mujoco.MjSpec) -> None:
-    """Mostly ambient light, and one slanted lamp that tells the faces of a gate apart."""
+    """Add mostly ambient light, and one slanted lamp that makes the faces of a gate distinguishable."""
     headlight = spec.visual.headlight
     headlight.ambient, headlight.diffuse, headlight.specular = (0.78,) * 3, (0.0,) * 3, (0.0,) * 3
     spec.worldbody.add_light(
@@ -210,7 +210,7 @@ def _add_box(spec: mujoco.MjSpec, name: str, low: Sequence[float], high: Sequenc
 
 
 def _material(spec: mujoco.MjSpec, rgb: Sequence[float]) -> str:
-    """Name of the matte material of a colour, added on first use."""
+    """Return the name of a colour's matte material, which is added on first use."""
     name = "matte_" + "_".join(f"{round(255 * channel):03d}" for channel in rgb)
     if spec.material(name) is None:
         spec.add_material(name=name, rgba=(*rgb, 1.0), specular=0.0, shininess=0.0, reflectance=0.0)
@@ -218,7 +218,7 @@ def _material(spec: mujoco.MjSpec, rgb: Sequence[float]) -> str:
 
 
 def _add_hall(spec: mujoco.MjSpec, track: Track) -> None:
-    """Floor at z = 0, ceiling and walls at the bounding box, yellow lines on the floor."""
+    """Add a floor at z = 0, ceiling and walls at the bounding box, and yellow lines on the floor."""
     (x0, y0, _), (x1, y1, z1) = track.bounds_low, track.bounds_high
     t = WALL_THICKNESS
     _add_box(spec, "floor", (x0 - t, y0 - t, -t), (x1 + t, y1 + t, 0.0), FLOOR)
@@ -228,7 +228,7 @@ def _add_hall(spec: mujoco.MjSpec, track: Track) -> None:
     _add_box(spec, "wall_y+", (x0, y1, 0.0), (x1, y1 + t, z1), WALLS["y+"])
     _add_box(spec, "wall_y-", (x0, y0 - t, 0.0), (x1, y0, z1), WALLS["y-"])
     half = LINE_WIDTH / 2
-    # without the sides against the floor and the walls, which take a tenth of a frame's time and are never seen
+    # without the sides against floor and walls, which are never visible and take a tenth of a frame's time
     lines = [((x - half, y0, 0.0), (x + half, y1, LINE_HEIGHT), "x-x+z+") for x in _spaced(x0, x1)]
     lines += [((x0, y - half, 0.0), (x1, y + half, LINE_HEIGHT), "y-y+z+") for y in _spaced(y0, y1)]
     _add_box_mesh(spec, "floor_lines", lines)
@@ -244,15 +244,15 @@ def _add_hall(spec: mujoco.MjSpec, track: Track) -> None:
 
 
 def _spaced(low: float, high: float) -> np.ndarray:
-    """Centred positions between two walls, `LINE_SPACING` apart."""
+    """Return centred positions between two walls, `LINE_SPACING` apart."""
     count = max(1, int((high - low) // LINE_SPACING))
     return (low + high) / 2 + (np.arange(count) - (count - 1) / 2) * LINE_SPACING
 
 
 Box = tuple[Sequence[float], Sequence[float], str]
-"""Low corner, high corner, and which sides there are: `x-x+y-y+z-z+` are all."""
+"""Low corner, high corner, and the sides to build: `x-x+y-y+z-z+` for all."""
 
-# corners, outward; corner 4 i + 2 j + k is at (low, high)[i] in x, [j] in y and [k] in z
+# corners of each side, facing outward; corner 4 i + 2 j + k is at (low, high)[i] in x, [j] in y and [k] in z
 SIDES = {
     "x-": (0, 1, 3, 2), "x+": (4, 6, 7, 5), "y-": (0, 4, 5, 1),
     "y+": (2, 3, 7, 6), "z-": (0, 2, 6, 4), "z+": (1, 5, 7, 3),
@@ -260,7 +260,7 @@ SIDES = {
 
 
 def _add_box_mesh(spec: mujoco.MjSpec, name: str, boxes: Sequence[Box]) -> None:
-    """Add axis-aligned boxes as one mesh: one draw call, however many boxes."""
+    """Add axis-aligned boxes as one mesh, which needs only one draw call."""
     corners = np.array([[i >> 2 & 1, i >> 1 & 1, i & 1] for i in range(8)])
     vertices: list[np.ndarray] = []
     faces: list[tuple[int, int, int]] = []
@@ -270,7 +270,7 @@ def _add_box_mesh(spec: mujoco.MjSpec, name: str, boxes: Sequence[Box]) -> None:
             if side not in sides:
                 continue
             start = len(vertices)
-            vertices.extend(corner[list(quad)])  # four vertices of its own per side, so that shading stays flat
+            vertices.extend(corner[list(quad)])  # separate vertices per side, for flat shading
             faces += [(start, start + 1, start + 2), (start, start + 2, start + 3)]
     spec.add_mesh(
         name=name,
@@ -286,7 +286,7 @@ def _add_gates(spec: mujoco.MjSpec, track: Track) -> None:
     bars = [
         ((-depth, -outer, inner), (depth, outer, outer), "x-x+y-y+z-z+"),  # top
         ((-depth, -outer, -outer), (depth, outer, -inner), "x-x+y-y+z-z+"),  # bottom
-        ((-depth, -outer, -inner), (depth, -inner, inner), "x-x+y-y+"),  # between them
+        ((-depth, -outer, -inner), (depth, -inner, inner), "x-x+y-y+"),  # sides
         ((-depth, inner, -inner), (depth, outer, inner), "x-x+y-y+"),
     ]
     _add_box_mesh(spec, "gate", bars)
@@ -312,13 +312,13 @@ def _add_gate(spec: mujoco.MjSpec, name: str, gate: Gate, rgb: Sequence[float]) 
 
 
 def gate_materials(model: mujoco.MjModel) -> list[int]:
-    """Return the materials of gates and decoys in a compiled scene."""
+    """Return the material indices of gates and decoys in a compiled scene."""
     names = (model.geom(index).name for index in range(model.ngeom))
     return sorted({int(model.geom(name).matid[0]) for name in names if name.startswith(("gate_", "decoy_"))})
 
 
 def _camera_attitude(tilt: float) -> np.ndarray:
-    """Quaternion wxyz of a camera (right x, up y, backwards z) that looks along body x, tilted up by degrees."""
+    """Return the quaternion wxyz of a camera (right x, up y, backwards z) looking along body x with an upward tilt."""
     cosine, sine = math.cos(math.radians(tilt)), math.sin(math.radians(tilt))
     right, up, backwards = (0.0, -1.0, 0.0), (-sine, 0.0, cosine), (-cosine, 0.0, -sine)
     quaternion = np.zeros(4)
@@ -327,7 +327,7 @@ def _camera_attitude(tilt: float) -> np.ndarray:
 
 
 def _add_airframe(spec: mujoco.MjSpec, body: mujoco.MjsBody, parameters: QuadrotorParameters) -> None:
-    """What a spectator sees of the drone; massless, and hidden from its own camera."""
+    """Add the visible geometry of the drone, which is massless and hidden from its own camera."""
     look = {"contype": 0, "conaffinity": 0, "group": DRONE_GROUP, "mass": 0.0}
     dark, front, rear = (0.12, 0.12, 0.13), (0.95, 0.95, 0.95), (0.15, 0.75, 0.25)
     body.add_geom(type=mujoco.mjtGeom.mjGEOM_BOX, size=(0.06, 0.03, 0.02), material=_material(spec, dark), **look)

@@ -1,4 +1,4 @@
-"""Warp beside torch on one device: in order on one stream, and captured into one CUDA graph."""
+"""Use of warp beside torch: kernels on the same CUDA stream, and captured into one CUDA graph."""
 
 from __future__ import annotations
 
@@ -17,10 +17,10 @@ from dreamer_racing.caches import ensure_caches
 
 @cache
 def load_warp() -> Any:
-    """Return the package `warp`, initialised so that it reports errors only: no CUDA is no news.
+    """Return the package `warp`, initialised so that it reports only errors, not the absence of CUDA.
 
     Raises:
-        CacheError: it finds no folder for what it compiles.
+        CacheError: there is no usable folder for its kernel cache.
     """
     ensure_caches()
     import warp
@@ -33,7 +33,7 @@ def load_warp() -> Any:
 
 @contextmanager
 def _silent() -> Iterator[None]:
-    """Drop what compiled code writes to the standard error stream: warp warns of an absent driver there."""
+    """Discard what compiled code writes to standard error, where warp warns of an absent driver."""
     sys.stderr.flush()
     kept, nowhere = os.dup(2), os.open(os.devnull, os.O_WRONLY)
     try:
@@ -46,19 +46,19 @@ def _silent() -> Iterator[None]:
 
 
 def scope(device: torch.device) -> Any:
-    """Let warp work on a device, on CUDA in torch's present stream, so that all is in order: a context manager.
+    """Return a context manager in which warp uses a device, on CUDA with torch's current stream, to keep the order.
 
-    It sets what is current for the whole process: two threads must not step worlds of different devices.
+    It sets warp's device for the whole process: two threads must not step worlds of different devices.
     """
     warp = load_warp()
     if device.type != "cuda":
         return warp.ScopedDevice(str(device))
-    # no waiting for the stream before: under a graph's capture that would draw another stream into it
+    # sync_enter would add another stream to a graph capture
     return warp.ScopedStream(_stream(warp, device), sync_enter=False)
 
 
 def _stream(warp: Any, device: torch.device) -> Any:
-    """Return the one warp stream of torch's present stream: captures are booked by the object."""
+    """Return the warp stream of torch's current stream, always the same object, by which warp tracks captures."""
     stream = torch.cuda.current_stream(device)
     key = (stream.device, stream.cuda_stream)  # every device's default stream has the handle 0
     if key not in _STREAMS:
@@ -70,10 +70,10 @@ _STREAMS: dict[tuple[torch.device, int], Any] = {}
 
 
 class GraphedFunction:
-    """Replays a function of a tensor, made of torch's and warp's kernels, as one CUDA graph.
+    """Replays a function of a tensor that runs torch and warp kernels, as one CUDA graph.
 
-    The function must not wait for the device, and must keep what it remembers in place. It is called a few times before
-    its capture, so that libraries allocate and compile: what that changed is for the caller to restore.
+    The function must not synchronise with the device, and must update its state in place. It is called a few times
+    before the capture, so that libraries allocate and compile; the caller must restore the state that this changes.
 
     Args:
         function: what to capture.
@@ -95,12 +95,12 @@ class GraphedFunction:
             with torch.cuda.graph(self._graph, stream=stream, capture_error_mode="thread_local"):
                 warp.capture_begin(stream=warp_stream, external=True)
                 self._outputs = tuple(function(self._input))
-                # keeps the kernels' modules loaded; what was allocated belongs to torch's graph
+                # keeps the kernels' modules loaded; allocations belong to torch's graph
                 self._warp_graph = warp.capture_end(stream=warp_stream)
         torch.cuda.current_stream(device).wait_stream(stream)
 
     def __call__(self, value: Tensor) -> tuple[Tensor, ...]:
-        """Return copies of what the function returns for a tensor like the example."""
+        """Return copies of the function's outputs for a tensor like the example."""
         self._input.copy_(value)
         self._graph.replay()
         return tuple(output.clone() for output in self._outputs)

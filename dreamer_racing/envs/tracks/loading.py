@@ -1,4 +1,4 @@
-"""Read a track from YAML, and refuse a bad file with the file, the field, its value and what is allowed; write one."""
+"""Reading and writing of tracks as YAML; errors name the file, the field, its value and what is allowed."""
 
 from __future__ import annotations
 
@@ -18,10 +18,10 @@ from dreamer_racing.envs.tracks.validation import validate_track
 from dreamer_racing.settings import quoted, shortened, suggestion
 
 BUILTIN_TRACKS: tuple[str, ...] = ("circle", "kidney", "figure8", "split_s", "figure8_decoys")
-"""Names that ``load_track`` knows without a path."""
+"""Track names that ``load_track`` accepts."""
 
 MAX_BYTES = 100_000
-"""Size of a track file; the most gates that a track may have take a tenth of it [choice]."""
+"""Maximum size of a track file; the maximum number of gates takes a tenth of it [choice]."""
 
 _FOLDER = Path(__file__).parent
 
@@ -30,8 +30,8 @@ def load_track(name_or_path: str | Path | Track) -> Track:
     """Return a checked track.
 
     Args:
-        name_or_path: a name out of ``BUILTIN_TRACKS``, the path of a ``.yaml`` file, or a ``Track``, which is checked
-            and returned.
+        name_or_path: a name from ``BUILTIN_TRACKS``, the path of a ``.yaml`` file, or a ``Track``, which is checked and
+            returned.
 
     Raises:
         TrackError: the track is unknown, cannot be read, or cannot be flown.
@@ -58,12 +58,12 @@ def _load_builtin(name: str) -> Track:
 
 
 def read_track(content: Any, source: str, name: str = "track") -> Track:
-    """Return the checked track that a file's content, or what `describe_track` returned, stands for.
+    """Return the checked track described by a file's content or a result of `describe_track`.
 
     Args:
-        content: Python objects as YAML or JSON gives them.
-        source: where they are from, for messages.
-        name: of the track, unless the content gives one.
+        content: Python objects as parsed from YAML or JSON.
+        source: their origin, for messages.
+        name: name of the track if the content has none.
 
     Raises:
         TrackError: a field is wrong, or the track cannot be flown.
@@ -74,7 +74,7 @@ def read_track(content: Any, source: str, name: str = "track") -> Track:
 
 
 def describe_track(track: Track) -> dict[str, Any]:
-    """Return the content of a file that is this track, with nothing left to defaults; `read_track` gives it back.
+    """Return the complete content of this track's file, without defaults, from which `read_track` restores it.
 
     Example:
         >>> track = load_track("kidney")
@@ -93,9 +93,9 @@ def describe_track(track: Track) -> dict[str, Any]:
 
 
 def hash_track(track: Track) -> str:
-    """Return the SHA-256 of where gates, decoys, start and bounds are and how gates look; name and laps play no part.
+    """Return the SHA-256 hash of a track's geometry and gate colours, without its name and laps.
 
-    It is of `describe_track` as JSON with sorted keys: the same track, by whatever file or name, gives the same.
+    It is computed from `describe_track` as JSON with sorted keys, so it does not depend on the track's file or name.
 
     Example:
         >>> hash_track(load_track("kidney")) == hash_track(dataclasses.replace(load_track("kidney"), name="mine"))
@@ -111,7 +111,7 @@ def _describe_gate(gate: Gate) -> dict[str, Any]:
 
 
 def _find(name_or_path: str | Path) -> Path:
-    """Turn a built-in name or a path into the path of a file."""
+    """Return the file path of a built-in name or a path."""
     if isinstance(name_or_path, str):
         if name_or_path in BUILTIN_TRACKS:
             return _FOLDER / f"{name_or_path}.yaml"
@@ -136,9 +136,9 @@ def _find(name_or_path: str | Path) -> Path:
 
 
 class _PlainLoader(yaml.SafeLoader):
-    """YAML's safe loader, which refuses a key given twice instead of keeping the last one silently, and aliases.
+    """YAML's safe loader that refuses duplicate keys, of which YAML silently keeps the last, and aliases.
 
-    Aliases let a small file stand for more than any memory holds.
+    With aliases, a small file can expand to more data than fits in memory.
     """
 
     def compose_node(self, parent: yaml.Node | None, index: int) -> yaml.Node | None:
@@ -178,13 +178,13 @@ def _parse(path: Path) -> Any:
 
 
 class _TrackReader:
-    """Turns a file's content into a ``Track``; every method names the field that it refuses."""
+    """Converts a file's content to a ``Track``; errors name the invalid field."""
 
     def __init__(self, source: str, name: str):
         self._source, self._name = source, name
 
     def read(self, content: Any) -> Track:
-        """Check the form of every field and fill in the defaults."""
+        """Check the type of every field and fill in the defaults."""
         if content is None:
             raise TrackError(f"{self._source}: the track file is empty; it must have gates, see docs/tracks.md.")
         content = self._mapping(
@@ -211,7 +211,7 @@ class _TrackReader:
         )
 
     def _gates(self, value: Any, where: str, kind: Literal["race", "decoy"]) -> list[Gate]:
-        """Read a list of gates that are all of one kind."""
+        """Read a list of gates of one kind."""
         if not isinstance(value, list):
             raise self._error(where, value, "a list of gates, each with a position and yaw_degrees")
         return [self._gate(item, f"{where}[{index}]", kind) for index, item in enumerate(value)]
@@ -234,7 +234,7 @@ class _TrackReader:
         )
 
     def _start(self, value: Any) -> tuple[Vector | None, float | None]:
-        """Read the start pose; None stands for what is left out."""
+        """Read the start pose; a missing field is None."""
         fields = self._mapping(value, "start", required=set(), optional={"position", "yaw_degrees"})
         position = self._vector(fields["position"], "start.position") if "position" in fields else None
         yaw_degrees = self._number(fields["yaw_degrees"], "start.yaw_degrees") if "yaw_degrees" in fields else None
@@ -246,14 +246,14 @@ class _TrackReader:
         return self._vector(fields["low"], "bounds.low"), self._vector(fields["high"], "bounds.high")
 
     def _shape(self, value: Any) -> GateShape:
-        """Read the measures of the gates."""
+        """Read the dimensions of the gates."""
         fields = self._mapping(value, "shape", required=set(), optional={"opening", "outer", "depth", "margin"})
         return GateShape(**{name: self._number(number, f"shape.{name}") for name, number in fields.items()})
 
     def _mapping(
         self, value: Any, where: str, *, required: Collection[str], optional: Collection[str] = ()
     ) -> dict[str, Any]:
-        """Read a mapping that has every required key and no unknown one."""
+        """Read a mapping with all required and no unknown keys."""
         allowed = sorted({*required, *optional})
         if not isinstance(value, dict):
             raise self._error(where, value, f"a mapping with the fields {', '.join(allowed)}")
@@ -291,7 +291,7 @@ class _TrackReader:
         return (red, green, blue)
 
     def _number(self, value: Any, where: str) -> float:
-        """Read a finite number; true and false are none."""
+        """Read a finite number; booleans are refused."""
         try:
             if isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value):
                 return float(value)
@@ -306,11 +306,11 @@ class _TrackReader:
         return value
 
     def _text(self, value: Any, where: str) -> str:
-        """Read a text that is not empty."""
+        """Read a non-empty string."""
         if not isinstance(value, str) or not value.strip():
             raise self._error(where, value, "a text that is not empty")
         return value
 
     def _error(self, where: str, value: Any, allowed: str) -> TrackError:
-        """Return the refusal of one field."""
+        """Return the error of an invalid field."""
         return refusal(self._source, where, value, allowed)

@@ -1,4 +1,4 @@
-"""What a track is: gates, their shape, the start pose and the bounding box.
+"""`Track`: gates, their shape, the start pose and the bounding box.
 
 Shape legend: G race gates. SI units, world z up. A gate's own axes are forward (direction of flight), left and up;
 gates stand upright, so one yaw angle turns the world's x axis into a gate's forward axis.
@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 Vector = tuple[float, float, float]
 
 GROUND_HEIGHT = 0.05
-"""Height (m) under which a drone has hit the ground [choice]: half of the drone's 0.1 m height."""
+"""Height (m) of a drone's centre below which it has hit the ground: half of its 0.1 m height [choice]."""
 
 START_DISTANCE = 2.5
 """Distance (m) of the default start pose before the first gate [choice]."""
@@ -32,16 +32,16 @@ DEFAULT_CEILING = 6.0
 
 
 class TrackError(ValueError):
-    """A track that cannot be flown, with one paragraph that says what is wrong, where, and what would be right."""
+    """Error of a track that cannot be read or flown; the message says what is wrong, where, and what would be right."""
 
 
 def refusal(source: str, field: str, value: object, allowed: str) -> TrackError:
-    """Return the refusal of one field."""
+    """Return the error of an invalid field."""
     return TrackError(f"{source}: {field} is {quoted(value)}, but must be {allowed}.")
 
 
 def _normalise(part: Any, numbers: Sequence[str], vectors: Sequence[str]) -> None:
-    """Make Python's floats, and tuples of them, of a frozen object's fields; what is none stays, to be refused."""
+    """Convert a frozen object's fields to floats and tuples of floats; others are left for validation to refuse."""
     for name in numbers:
         object.__setattr__(part, name, _as_float(getattr(part, name)))
     for name in vectors:
@@ -50,7 +50,7 @@ def _normalise(part: Any, numbers: Sequence[str], vectors: Sequence[str]) -> Non
 
 
 def _as_float(value: Any) -> Any:
-    value = value.tolist() if hasattr(value, "tolist") else value  # NumPy's and torch's
+    value = value.tolist() if hasattr(value, "tolist") else value  # of NumPy and torch
     try:
         return float(value) if is_number(value) else value
     except OverflowError:
@@ -66,12 +66,12 @@ def _as_tuple(value: Any) -> Any:
 class Gate:
     """One square gate, standing upright.
 
-    Numbers may be of any kind, vectors any sequences or arrays of them: they become floats, and tuples of floats.
+    Numbers of any type become floats, and sequences or arrays become tuples of floats.
 
     Args:
         position: centre of the opening in the world, m.
         yaw_degrees: direction of flight through the gate, degrees from the world's x axis towards y.
-        kind: ``"race"`` gates are flown in order; ``"decoy"`` gates are drawn only (no reward, no crash, no order).
+        kind: ``"race"`` gates are flown in order; ``"decoy"`` gates are only rendered (no reward, crash or order).
         color: RGB in [0, 1], or None for the scene's own colour.
     """
 
@@ -98,13 +98,13 @@ class Gate:
 
 @dataclasses.dataclass(frozen=True)
 class GateShape:
-    """The measures shared by all gates of a track, m.
+    """Dimensions shared by all gates of a track, m.
 
     Args:
         opening: side of the square opening. Reference: uzh-rpg/agile_flight.
         outer: side of the square frame's outside. Reference: uzh-rpg/agile_flight.
         depth: thickness of the frame along the direction of flight. Reference: uzh-rpg/agile_flight.
-        margin: how much nearer than ``opening / 2`` to the centre a drone must pass on both axes [choice].
+        margin: on both axes, a drone's centre must pass this much inside the opening's edges [choice].
     """
 
     opening: float = 1.5
@@ -117,20 +117,20 @@ class GateShape:
 
     @property
     def pass_half_width(self) -> float:
-        """Half of the side of the margin-reduced opening: what a drone's centre has to go through, m."""
+        """Half side of the margin-reduced opening, through which a drone's centre must pass, m."""
         return self.opening / 2 - self.margin
 
 
 @dataclasses.dataclass(frozen=True)
 class Track:
-    """Everything about a race that is not the drone. Read one with ``load_track`` or build one with ``make_track``.
+    """A race track. Read one with ``load_track`` or build one with ``make_track``.
 
     Args:
         name: short name, for logs and plots.
         gates: race gates in the order of flight.
-        decoys: gates that are drawn only.
-        shape: measures of every gate.
-        start_position: where an episode starts, m.
+        decoys: gates that are only rendered.
+        shape: dimensions of every gate.
+        start_position: position of the start pose, m.
         start_yaw_degrees: heading of the start pose.
         bounds_low: lower corner of the box that a drone must not leave, m.
         bounds_high: upper corner of the same box, m.
@@ -161,7 +161,7 @@ class Track:
 
     @property
     def gate_distances(self) -> tuple[float, ...]:
-        """Straight distances between the centres of gates that follow each other, of the last to the first last, m."""
+        """Straight distances between the centres of successive gates, ending with last to first, m."""
         following = (*self.gates[1:], self.gates[0])
         return tuple(
             math.dist(gate.position, next_.position) for gate, next_ in zip(self.gates, following, strict=True)
@@ -187,7 +187,7 @@ class Track:
 
 
 def _tensor(values: Any, device: torch.device | str, dtype: torch.dtype | None) -> torch.Tensor:
-    """Return numbers as a tensor, float32 if not said otherwise; who only reads a track does not load torch."""
+    """Return numbers as a tensor, float32 by default; torch is imported here, as reading tracks does not need it."""
     import torch
 
     return torch.tensor(values, device=device, dtype=dtype or torch.float32)
@@ -205,13 +205,13 @@ def make_track(
     bounds_high: Vector | None = None,
     laps: int = 3,
 ) -> Track:
-    """Build a track and fill in what is not given. ``load_track`` checks the result.
+    """Build a track with defaults for what is not given. ``load_track`` checks the result.
 
     Args:
         name: short name, for logs and plots.
         gates: race gates in the order of flight, at least one.
-        decoys: gates that are drawn only.
-        shape: measures of every gate; None for the defaults of ``GateShape``.
+        decoys: gates that are only rendered.
+        shape: dimensions of every gate; None for the defaults of ``GateShape``.
         start_position: m; None for 2.5 m before the first gate, at its height.
         start_yaw_degrees: None to face the centre of the first gate.
         bounds_low: m; None for 3 m outside the race gates' frames, from the floor.
@@ -219,7 +219,7 @@ def make_track(
         laps: number of laps of an evaluation episode.
 
     Raises:
-        TrackError: a gate, a measure or the start is no number where defaults follow from it.
+        TrackError: a gate, a dimension or the start from which defaults are computed is not finite.
 
     Example:
         >>> make_track("line", [Gate((0, 0, 1.35), 0), Gate((5, 0, 1.35), 0)]).start_position
@@ -249,7 +249,7 @@ def make_track(
 
 
 def require_gates(source: str, field: str, gates: Sequence[Gate]) -> None:
-    """Refuse what is no gate, and gates of which it is not known where they are, or how they are turned."""
+    """Refuse items that are not gates, and gates without a finite position or yaw."""
     if not isinstance(gates, Sequence):
         raise refusal(source, field, gates, "a sequence of gates")
     for index, gate in enumerate(gates):
@@ -260,7 +260,7 @@ def require_gates(source: str, field: str, gates: Sequence[Gate]) -> None:
 
 
 def require_shape(source: str, shape: GateShape) -> None:
-    """Refuse measures that are no finite numbers."""
+    """Refuse dimensions that are not finite numbers."""
     if not isinstance(shape, GateShape):
         raise refusal(source, "shape", shape, "a GateShape")
     for field in dataclasses.fields(shape):
@@ -268,13 +268,13 @@ def require_shape(source: str, shape: GateShape) -> None:
 
 
 def require_vector(source: str, field: str, value: object) -> None:
-    """Refuse what is not three finite numbers."""
+    """Refuse a value that is not three finite numbers."""
     if not (isinstance(value, tuple) and len(value) == 3 and all(map(_is_finite, value))):
         raise refusal(source, field, value, "three finite numbers (x, y, z) in m")
 
 
 def require_number(source: str, field: str, value: object) -> None:
-    """Refuse what is no finite number."""
+    """Refuse a value that is not a finite number."""
     if not _is_finite(value):
         raise refusal(source, field, value, "a finite number")
 
@@ -298,7 +298,7 @@ def _bearing(origin: Vector, target: Vector) -> float:
 def _default_bounds(gates: Sequence[Gate], shape: GateShape) -> tuple[Vector, Vector]:
     """Return the corners of the box that clears every race gate's frame by 3 m on each side, 0–6 m high.
 
-    Decoys do not count: the flyable space of a track is the same with and without them.
+    Decoys are ignored, so that the flyable space of a track is the same with and without them.
     """
     low, high = [math.inf, math.inf], [-math.inf, -math.inf]
     for gate in gates:

@@ -1,9 +1,9 @@
-"""Whether a track can be flown: the rules about numbers and geometry, for files and for tracks built in Python.
+"""Validation of tracks: checks of numbers and geometry, for files and for tracks built in Python.
 
-Overlap. A gate's frame must not reach into another gate's opening: two gates are refused when the box of one opening
-(opening × opening × depth) intersects the box of the other frame (outer × outer × depth). Bars that only touch or
-cross other bars are accepted, because both are obstacles anyway and every opening stays free: the two stacked gates
-of the published Split-S track share 7 cm of frame in just this way.
+Overlap. A gate's frame must not reach into another gate's opening: two gates are refused if the box of one opening
+(opening × opening × depth) intersects the box of the other frame (outer × outer × depth). Frames may touch or overlap
+other frames, because both are obstacles and every opening stays free: the two stacked gates of the published Split-S
+track share 7 cm of frame.
 
 Reach. The margin-reduced opening must lie inside the bounding box and above the ground, and so must the metre before
 it, where training episodes may begin. A frame may stand on the ground or touch a wall.
@@ -29,25 +29,25 @@ from dreamer_racing.envs.tracks.track import (
 )
 
 ROUNDING = 1e-9
-"""How far (m) rounding may carry a point over a limit that it stands on."""
+"""Tolerance (m) for rounding errors of points on a limit."""
 
 START_CLEARANCE = 0.3
-"""Distance (m) that every start keeps from the bounding box and the ground [choice]."""
+"""Minimum distance (m) of every start from the bounding box and the ground [choice]."""
 
 GATE_CLEARANCE = 1.0
-"""Distance (m) of a start from a gate's plane: the noise of a training start moves it by at most 0.71 m [choice]."""
+"""Minimum distance (m) of a start from a gate's plane: training noise moves a start by at most 0.71 m [choice]."""
 
 FARTHEST = 1000.0
-"""Largest coordinate (m), at which float32 still tells 0.1 mm [choice]."""
+"""Largest coordinate (m), at which float32 still resolves 0.1 mm [choice]."""
 
 FARTHEST_LEG = 540.0
-"""Longest way (m) from one gate to the next: what 18 m/s make of an evaluation's 30 s, a whole flight [choice]."""
+"""Largest distance (m) from one gate to the next: a whole evaluation, 30 s, at 18 m/s [choice]."""
 
 SMALLEST = 0.01
-"""Least opening, thickness and width of the bars of a gate (m) [choice]."""
+"""Minimum opening, depth and frame width of a gate (m) [choice]."""
 
 MAX_GATES, MAX_LAPS = 200, 1000
-"""Gates and decoys together, of which all pairs are checked, and laps [choice]."""
+"""Maximum number of gates and decoys together, of which all pairs are checked, and of laps [choice]."""
 
 
 def validate_track(track: Track, source: str) -> None:
@@ -55,10 +55,10 @@ def validate_track(track: Track, source: str) -> None:
 
     Args:
         track: the track to check.
-        source: what to call it in a message: its file, usually.
+        source: name of the track in messages, usually its file.
 
     Raises:
-        TrackError: with source, field, value and what is allowed.
+        TrackError: the message has source, field, value and what is allowed.
     """
     _check_numbers(track, source)
     _check_kinds(track, source)
@@ -85,13 +85,13 @@ def flyable_box(track: Track, clearance: float) -> tuple[Vector, Vector]:
 
 
 def _named_gates(track: Track) -> list[tuple[str, Gate]]:
-    """Return every gate with the name of its field in a file."""
+    """Return every gate with its field name in a file."""
     race = [(f"gates[{index}]", gate) for index, gate in enumerate(track.gates)]
     return race + [(f"decoys[{index}]", gate) for index, gate in enumerate(track.decoys)]
 
 
 def _check_numbers(track: Track, source: str) -> None:
-    """Refuse what is no number where one belongs: places, directions, measures, colours and laps."""
+    """Refuse invalid numbers in positions, directions, dimensions, colours and laps."""
     for name in ("gates", "decoys"):
         require_gates(source, name, getattr(track, name))
     require_shape(source, track.shape)
@@ -115,12 +115,12 @@ def _check_numbers(track: Track, source: str) -> None:
 
 
 def _is_color(value: object) -> bool:
-    """Tell whether this is red, green and blue."""
+    """Return whether a value is an RGB colour."""
     return isinstance(value, tuple) and len(value) == 3 and all(isinstance(x, float) and 0 <= x <= 1 for x in value)
 
 
 def _check_kinds(track: Track, source: str) -> None:
-    """Refuse too few race gates, and gates listed under the wrong name."""
+    """Refuse too few or too many gates, and gates listed under the wrong kind."""
     if len(track.gates) < 2:
         raise refusal(source, "gates", track.gates, "at least 2 race gates, so that there is a lap")
     if (count := len(track.gates) + len(track.decoys)) > MAX_GATES:
@@ -132,7 +132,7 @@ def _check_kinds(track: Track, source: str) -> None:
 
 
 def _check_shape(shape: GateShape, source: str) -> None:
-    """Refuse gates without an opening, a frame or a thickness."""
+    """Refuse gates whose opening, frame, depth or margin is out of range."""
     if shape.opening < SMALLEST:
         raise refusal(source, "shape.opening", shape.opening, f"greater than 0 m, {SMALLEST} m at least")
     if shape.outer <= shape.opening + 2 * SMALLEST - ROUNDING:
@@ -148,7 +148,7 @@ def _check_shape(shape: GateShape, source: str) -> None:
 
 
 def _check_bounds(track: Track, source: str) -> None:
-    """Refuse a bounding box without an inside."""
+    """Refuse an empty bounding box."""
     for axis, letter in enumerate("xyz"):
         if track.bounds_low[axis] >= track.bounds_high[axis]:
             allowed = f"greater than bounds.low, which is {track.bounds_low[axis]} m on the {letter} axis"
@@ -156,7 +156,7 @@ def _check_bounds(track: Track, source: str) -> None:
 
 
 def _check_reach(track: Track, name: str, gate: Gate, source: str) -> None:
-    """Refuse a race gate whose opening, or the metre before it, is not in the space that can be flown."""
+    """Refuse a race gate whose opening, or the metre before it, is outside the flyable space."""
     low, high = flyable_box(track, clearance=0.0)
     half = track.shape.pass_half_width
     for left in (-half, half):
@@ -190,7 +190,7 @@ def _check_overlaps(track: Track, source: str) -> None:
 
 
 def _check_start(track: Track, source: str) -> None:
-    """Refuse a start outside the box, behind the first gate's plane, or too near a gate."""
+    """Refuse a start outside the box, behind the first gate's plane, or too close to a gate."""
     start = track.start_position
     if not _inside(start, *flyable_box(track, START_CLEARANCE)):
         allowed = f"at least {START_CLEARANCE} m inside the bounding box {_box(track)} and above {GROUND_HEIGHT} m"
@@ -209,7 +209,7 @@ def _check_start(track: Track, source: str) -> None:
 
 
 def _check_legs(track: Track, source: str) -> None:
-    """Refuse a race gate that no flight is long enough to reach."""
+    """Refuse a race gate that is too far away to be reached in an evaluation."""
     places = [("start.position", track.start_position)]
     places += [(f"gates[{index}].position", gate.position) for index, gate in enumerate(track.gates)]
     if track.laps > 1:
@@ -221,10 +221,10 @@ def _check_legs(track: Track, source: str) -> None:
 
 
 def boxes_intersect(gate: Gate, side: float, other: Gate, other_side: float, depth: float) -> bool:
-    """Tell whether two upright boxes (depth × side × side) share more than their surface.
+    """Return whether two upright boxes (depth × side × side) share more than their surface.
 
-    The boxes stand upright, so they intersect if their heights do and if their ground plans do: two rectangles are
-    apart exactly if their projections are apart on the axis of one of their sides (separating axis theorem).
+    Upright boxes intersect if both their heights and their ground plans do. Two rectangles are disjoint exactly if
+    their projections are disjoint on the axis of one of their sides (separating axis theorem).
     """
     gap = [b - a for a, b in zip(gate.position, other.position, strict=True)]
     if abs(gap[2]) >= (side + other_side) / 2:
@@ -237,7 +237,7 @@ def boxes_intersect(gate: Gate, side: float, other: Gate, other_side: float, dep
 
 
 def _half_shadow(gate: Gate, side: float, depth: float, axis: Vector) -> float:
-    """Return half of the length of a gate box's projection on a horizontal axis, m."""
+    """Return half the length of a gate box's projection on a horizontal axis, m."""
     return (depth * abs(_dot(gate.forward, axis)) + side * abs(_dot(gate.left, axis))) / 2
 
 
@@ -248,7 +248,7 @@ def _coordinates(gate: Gate, point: Vector) -> Vector:
 
 
 def _offset(gate: Gate, forward: float, left: float, up: float) -> Vector:
-    """Return a point given in a gate's own axes in the world, m."""
+    """Return the world position of a point given in a gate's axes, m."""
     x, y, z = gate.position
     return (
         x + forward * gate.forward[0] + left * gate.left[0],
@@ -258,17 +258,17 @@ def _offset(gate: Gate, forward: float, left: float, up: float) -> Vector:
 
 
 def _dot(a: Vector | list[float], b: Vector) -> float:
-    """Return the scalar product."""
+    """Return the dot product."""
     return sum(x * y for x, y in zip(a, b, strict=True))
 
 
 def _inside(point: Vector, low: Vector, high: Vector) -> bool:
-    """Tell whether a point lies in a box, its surface included."""
+    """Return whether a point lies in a box, including its surface."""
     return all(a - ROUNDING <= x <= b + ROUNDING for a, x, b in zip(low, point, high, strict=True))
 
 
 def _box(track: Track) -> str:
-    """Write the bounding box."""
+    """Format the bounding box for a message."""
     return f"from {_rounded(track.bounds_low)} to {_rounded(track.bounds_high)}"
 
 

@@ -1,4 +1,4 @@
-"""Tracks made from other tracks: with decoys, and with their gates displaced."""
+"""Variants of tracks: with decoys, and with displaced gates."""
 
 from __future__ import annotations
 
@@ -14,23 +14,23 @@ if TYPE_CHECKING:
     import torch
 
 DECOYS = {"paper": {"figure8": "figure8_decoys"}}
-"""Sets of decoys: for each the tracks that have it, and the built-in track that shows where its decoys stand."""
+"""Sets of decoys: for each set, the plain tracks that have it and the built-in track with these decoys."""
 
 PLAIN_TRACKS: tuple[str, ...] = tuple(
     name for name in BUILTIN_TRACKS if not any(name in places.values() for places in DECOYS.values())
 )
-"""Built-in tracks without those that another one becomes by decoys, for these are the same race."""
+"""Built-in tracks, without those that only add decoys to another one, which are the same race."""
 
 ATTEMPTS = 1000
-"""Displacements drawn until one can be flown [choice]."""
+"""Maximum number of displacements drawn to find one that can be flown [choice]."""
 
 
 def with_decoys(track: str | Path | Track, decoys: str | None) -> Track:
-    """Return a track with a set of decoys, gates that are drawn and nothing else, or as it is.
+    """Return a track with a set of decoys (gates that are only rendered), unchanged, or without decoys.
 
     Args:
-        track: what `load_track` takes; one that has these decoys already is returned as it is.
-        decoys: name of the set; None to leave the track alone, ``"none"`` to take away the decoys that it has.
+        track: an argument of `load_track`; a track that already has these decoys is returned unchanged.
+        decoys: name of the set; None to leave the track unchanged, ``"none"`` to remove its decoys.
 
     Raises:
         TrackError: unknown track or set, or a track without this set.
@@ -58,7 +58,7 @@ def with_decoys(track: str | Path | Track, decoys: str | None) -> Track:
 
 
 def decoys_for(track: Track) -> str | None:
-    """Return the name of the set of decoys of a track, which may be without them; None if there is none."""
+    """Return the name of the set of decoys that a track has or can have; None if there is none."""
     for name, places in DECOYS.items():
         if any(track in (load_track(plain), load_track(decorated)) for plain, decorated in places.items()):
             return name
@@ -66,7 +66,7 @@ def decoys_for(track: Track) -> str | None:
 
 
 def _without_decoys(track: Track) -> Track:
-    """Take away the decoys; the rest of a built-in track is the track that it was made from."""
+    """Remove the decoys; for a built-in variant, return the plain track."""
     for places in DECOYS.values():
         for plain, decorated in places.items():
             if track == load_track(decorated):
@@ -75,15 +75,15 @@ def _without_decoys(track: Track) -> Track:
 
 
 def displace_gates(track: Track, shift: float, turn_degrees: float, seed: int) -> Track:
-    """Move and turn every race gate at random; start, bounding box and decoys stay.
+    """Shift and rotate every race gate at random; start, bounding box and decoys are unchanged.
 
-    A displacement that cannot be flown is drawn again as a whole.
+    If the resulting track cannot be flown, all gates are drawn again.
 
     Args:
         track: the track.
-        shift: radius of the ball from which each gate's displacement is drawn evenly, m.
-        turn_degrees: half-width of the uniform draw of each gate's turn about the vertical, degrees.
-        seed: of the draw; the same one gives the same track.
+        shift: radius of the ball from which each gate's displacement is drawn uniformly, m.
+        turn_degrees: half-width of the uniform rotation of each gate about the vertical, degrees.
+        seed: seed of the draw; the same seed gives the same track.
 
     Raises:
         TrackError: no displacement was found that can be flown.
@@ -93,7 +93,7 @@ def displace_gates(track: Track, shift: float, turn_degrees: float, seed: int) -
         >>> displaced.start_position == load_track("circle").start_position
         True
     """
-    import torch  # who does not displace gates does not load it
+    import torch  # only loaded to displace gates
 
     generator = torch.Generator().manual_seed(seed)
     for _ in range(ATTEMPTS):

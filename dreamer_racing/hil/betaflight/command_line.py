@@ -1,6 +1,6 @@
-"""The CLI of a Betaflight on this machine, over TCP: lines in, what it says to them out.
+"""The CLI of a Betaflight on this machine, over TCP: sends lines, and returns the answers.
 
-It is entered by ``#`` and answers each line with its echo, what there is to say, and a prompt.
+The CLI is entered by ``#``, and answers each line with its echo, the output, and a prompt.
 
 Reference: https://betaflight.com/docs/development/Cli; src/main/cli/cli.c.
 """
@@ -17,14 +17,14 @@ _REFUSED = re.compile(r"###ERROR.*|.*unknown command.*|.*invalid .*", re.IGNOREC
 
 
 class CommandLine:
-    """A session in the CLI; a firmware in it does not arm until it has been started again.
+    """A session in the CLI, after which the firmware does not arm until it is restarted.
 
     Args:
-        port: TCP, on this machine.
-        patience: s for which an answer is waited for.
+        port: TCP port on this machine.
+        patience: s to wait for an answer.
 
     Raises:
-        OSError: Nobody answers there, in words.
+        OSError: No firmware answers at the port.
     """
 
     def __init__(self, port: int, patience: float = 30.0) -> None:
@@ -38,22 +38,22 @@ class CommandLine:
             except OSError:
                 self._socket.close()
                 if time.monotonic() > deadline:
-                    raise  # else it may have come while the firmware was still booting, which is lost
+                    raise  # else try again: a ``#`` sent while the firmware boots is lost
 
     def say(self, line: str) -> str:
-        """Type a line; return what it says to it, without echo and prompt.
+        """Type a line; return the answer, without echo and prompt.
 
         Raises:
-            OSError: It does not answer.
+            OSError: The firmware does not answer.
         """
         answer = self._read_to_prompt(line.encode("ascii") + b"\n").decode("utf-8", errors="replace")
         return answer.replace("\r", "").removeprefix(line).strip()
 
     def type_all(self, lines: list[str]) -> dict[str, str]:
-        """Type lines, but for comments; return those that it did not take, with its words.
+        """Type lines other than comments; return the refused ones, with the firmware's messages.
 
         Raises:
-            OSError: It does not answer.
+            OSError: The firmware does not answer.
         """
         refused = {}
         for line in lines:
@@ -88,7 +88,7 @@ class CommandLine:
 
 
 def connect(port: int, patience: float) -> socket.socket:
-    """Return a connection to a port of this machine that may not be open yet."""
+    """Return a connection to a port of this machine, waiting for it to open."""
     deadline = time.monotonic() + patience
     while True:
         try:

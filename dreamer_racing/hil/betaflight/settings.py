@@ -1,9 +1,10 @@
-"""What a Betaflight flight controller must be set to for an actor, and whether it is.
+"""The Betaflight settings that an actor needs, and their comparison with those of a flight controller.
 
 Reference: https://betaflight.com/docs/wiki/guides/current/Betaflight-2025.12-CLI-commands and the same page of 4.5:
 names, ranges and defaults. The firmware's src/main/fc/rc.c: rates; src/main/cli/cli.c: what a dump looks like;
 src/main/flight/pid.h, src/main/pg/rx.c and src/main/sensors/gyro.c: defaults of feedforward, smoothing, spin recovery.
-serial_update_rate_hz: src/main/msp/msp_serial.c (mspSerialProcess), src/main/fc/tasks.c. MSP override: https://betaflight.com/docs/wiki/guides/current/MSP-Companion-Computer-Control.
+serial_update_rate_hz: src/main/msp/msp_serial.c (mspSerialProcess), src/main/fc/tasks.c. MSP override:
+https://betaflight.com/docs/wiki/guides/current/MSP-Companion-Computer-Control.
 """
 
 from __future__ import annotations
@@ -21,7 +22,7 @@ AXES = {"roll": "body_rate_x", "pitch": "body_rate_y", "yaw": "body_rate_z"}
 LINKS = ("crsf", "sbus", "msp", "msp_override", "betaflight_sitl")
 
 _STEP = math.radians(10.0)  # rad/s: the unit of rc_rate and srate under ACTUAL rates
-_LARGEST = 199  # of these: setpoints end at 1998 deg/s
+_LARGEST = 199  # in this unit: setpoints end at 1998 deg/s
 _DEFAULTS_SINCE = (4, 5)  # release from which on the defaults below are known to hold
 _NO_DUMP = (
     "This is no dump of a Betaflight flight controller: {}. Open the CLI of the configurator, type `dump all`, save "
@@ -30,17 +31,17 @@ _NO_DUMP = (
 
 
 class Wanted(NamedTuple):
-    """A setting that matters.
+    """A required setting.
 
     Args:
-        name: Of the setting, or of whatever else the dump is read for.
-        value: It must have.
+        name: Name of the setting, or of another property read from the dump.
+        value: The required value.
         reason: Why.
-        default: The firmware's own, where it does not depend on board or release; ``diff`` leaves it out.
-        section: ``profile`` or ``rateprofile`` where each profile has its own.
-        line: For the CLI; made from name and value if empty.
+        default: The firmware's default, if it does not depend on board or release; ``diff`` leaves it out.
+        section: ``profile`` or ``rateprofile`` if each profile has its own.
+        line: Line for the CLI; made from name and value if empty.
         former: Its name in older releases.
-        absent: Whether a firmware that does not have it does what is wanted: then ``dump all`` need not name it.
+        absent: Whether a firmware without the setting behaves as required: then ``dump all`` need not name it.
     """
 
     name: str
@@ -54,7 +55,7 @@ class Wanted(NamedTuple):
 
     @property
     def command(self) -> str:
-        """What to type into the CLI."""
+        """The line to type into the CLI."""
         if self.name.startswith("feature "):
             return self.name.replace(" ", " " if self.value == "ON" else " -")
         return self.line or f"set {self.name} = {self.value}"
@@ -69,7 +70,7 @@ class Status(enum.Enum):
 
 
 class Finding(NamedTuple):
-    """A setting compared: what is wanted, how it is, and its value (None: not known)."""
+    """A compared setting: the required one, the result, and the value found (None: unknown)."""
 
     wanted: Wanted
     status: Status
@@ -85,9 +86,9 @@ class Finding(NamedTuple):
 
 
 def rate_map(contract: dict[str, Any]) -> RateMap:
-    """Return the rates at full stick that a flight controller set by this module has.
+    """Return the rates at full stick of a flight controller that is configured by this module.
 
-    They are the contract's largest, rounded up to the next 10 deg/s, which is what Betaflight can be set to.
+    They are the contract's largest, rounded up to the next 10 deg/s, which is Betaflight's resolution.
 
     Raises:
         ValueError: The contract has no body rates, or larger ones than Betaflight can follow.
@@ -96,7 +97,7 @@ def rate_map(contract: dict[str, Any]) -> RateMap:
 
 
 def wanted_settings(contract: dict[str, Any], link: str) -> list[Wanted]:
-    """Return every setting that matters for an actor, in the order in which to type them.
+    """Return all settings that an actor needs, in the order in which to type them.
 
     Args:
         contract: As `read_contract` returns it.
@@ -109,7 +110,7 @@ def wanted_settings(contract: dict[str, Any], link: str) -> list[Wanted]:
 
 
 def print_settings(contract: dict[str, Any], link: str) -> list[str]:
-    """Return lines for the CLI. They are plain ASCII: other characters, tabs and question marks mean things there."""
+    """Return lines for the CLI, in plain ASCII: other characters, tabs and question marks have a meaning there."""
     asked = ", ".join(f"{rate:.6g}" for rate in _asked_rates(contract).values())
     rates = rate_map(contract)
     full = [f"{axis}={getattr(rates, axis):.6g}" for axis in AXES]
@@ -125,10 +126,10 @@ def print_settings(contract: dict[str, Any], link: str) -> list[str]:
 
 
 def check_dump(text: str, contract: dict[str, Any], link: str) -> list[Finding]:
-    """Compare what the CLI said to ``dump all`` or ``diff all`` with what is wanted.
+    """Compare the output of ``dump all`` or ``diff all`` with the required settings.
 
     Raises:
-        ValueError: It said neither; or as `wanted_settings`.
+        ValueError: The text is neither; or as `wanted_settings`.
     """
     wanted_all = wanted_settings(contract, link)
     values, version = _read_dump(text, {name: each.section for each in wanted_all for name in (each.name, each.former)})
@@ -144,10 +145,10 @@ def check_dump(text: str, contract: dict[str, Any], link: str) -> list[Finding]:
 
 
 def require_dump(path: Path, contract: dict[str, Any], link: str) -> int:
-    """Refuse to fly with a flight controller whose settings are not those of an actor; return how many were compared.
+    """Refuse a flight controller whose settings do not fit an actor; return how many settings were compared.
 
     Args:
-        path: The text that ``dump all`` or ``diff all`` gave.
+        path: File with the output of ``dump all`` or ``diff all``.
         contract: As `read_contract` returns it.
         link: One of `LINKS`.
 
@@ -165,7 +166,7 @@ def require_dump(path: Path, contract: dict[str, Any], link: str) -> int:
 
 
 def _read_dump(text: str, sections: dict[str, str]) -> tuple[dict[str, str], tuple[int, int] | None]:
-    """Return values by name, of the profiles selected at the end, and the firmware's release where it is said."""
+    """Return values by name, of the profiles selected at the end, and the firmware's release if stated."""
     version = re.search(r"^#\s*(\w+) ?/.* (\d+)\.(\d+)\.\d+", text, re.MULTILINE)
     settings = re.findall(r"^set \w+ = ", text, re.MULTILINE)
     if version is None and not settings:
@@ -195,10 +196,9 @@ def _read_dump(text: str, sections: dict[str, str]) -> tuple[dict[str, str], tup
 
 
 def _read_modes(modes: list[list[str]]) -> dict[str, str]:
-    """Return what arms and what overrides, and whether sticks mean angles with AUX1 at 2000 µs, others at 1000 µs.
+    """Return the arm and override switches, and whether levelling is on with AUX1 at 2000 µs, others at 1000 µs.
 
-    Args:
-        modes: Number of the mode (`hil.betaflight.status`), index of the switch, from and to in µs, and more.
+    Each mode is given as its number (`hil.betaflight.status`), index of the switch, from and to in µs, and more.
     """
     ranges = [tuple(map(int, mode[:4])) for mode in modes if len(mode) >= 4 and all(map(str.isdigit, mode[:4]))]
     arms = [f"AUX{switch + 1} {low}-{high}" for mode, switch, low, high in ranges if mode == ARM and low < high]
@@ -218,7 +218,7 @@ def _read_modes(modes: list[list[str]]) -> dict[str, str]:
 
 
 def _receiver(link: str) -> list[Wanted]:
-    """Return what makes the flight controller listen to a link."""
+    """Return the settings by which the flight controller listens to a link."""
     if link not in LINKS:
         raise ValueError(f"link={link}: must be one of {', '.join(LINKS)}.")
     if link == "betaflight_sitl":
@@ -227,7 +227,7 @@ def _receiver(link: str) -> list[Wanted]:
         return [*_OVERRIDE, _MSP_RATE]
     serial = link != "msp"
     alone = "" if serial else "; nobody else can take over, so for the bench or a cage"
-    # a firmware that was built without one of them does not have it on
+    # a firmware built without one of these features has it off
     rx_serial = Wanted(
         "feature RX_SERIAL",
         "ON" if serial else "OFF",
@@ -240,17 +240,17 @@ def _receiver(link: str) -> list[Wanted]:
     )
     if not serial:
         return [rx_serial, rx_msp, _MSP_RATE]
-    # The one that is off comes first: the firmware keeps one receiver, and not always the last.
+    # The one that is off comes first: the firmware keeps one receiver, not always the last set.
     return [rx_msp, rx_serial, Wanted("serialrx_provider", link.upper(), "the protocol of the link")]
 
 
 def _switches(link: str) -> tuple[Wanted, ...]:
-    """Return what arms, and by which switches it flies."""
+    """Return the settings of the switches for arming and flight modes."""
     return _BY_PILOT if link == "msp_override" else _BY_LINK
 
 
 def _rates(contract: dict[str, Any]) -> list[Wanted]:
-    """Return what makes the sticks ask for body rates linearly, and the throttle for thrust untouched."""
+    """Return the settings that make body rates linear in the sticks, and leave the throttle unchanged."""
     wanted = [("rates_type", "ACTUAL", "rates in units of 10 deg/s", "ACTUAL")]
     for axis, steps in _rate_steps(contract).items():
         full = f"full {axis} stick is {10 * steps} deg/s"

@@ -1,10 +1,10 @@
-"""What a Betaflight says of itself by MSP: which modes are on, whether it is armed, and what speaks against it.
+"""The status of a Betaflight by MSP: which modes are on, whether it is armed, and what prevents arming.
 
-MSP_STATUS (101), asked for without payload. The answer's payload, little endian: cycle time u16, errors u16, sensors
-u16, modes u32 (bit 0: armed), profile u8, load u16, u16; then the count n of further bytes of modes in the lowest 4
-bits of one u8, these n, how many flags there are u8, and the flags that keep it from arming u32. Names are those of the
-CLI's ``status``. The switch is the last flag in every release; those from 25 to it depend on the release. Which mode a
-bit is of, the answer to MSP_BOXIDS (119) says: a u8 for each, its number in the CLI's ``aux``.
+MSP_STATUS (101) is requested without payload. The answer's payload, little endian: cycle time u16, errors u16, sensors
+u16, modes u32 (bit 0: armed), profile u8, load u16, u16; a u8 whose lowest 4 bits give the number n of further bytes of
+modes, these n bytes, the number of arming-disable flags u8, and these flags u32. Names are those of the CLI's
+``status``. The arm switch is the last flag in every release; those from 25 up to it depend on the release. The answer
+to MSP_BOXIDS (119) gives the mode of each bit: a u8 each, its number in the CLI's ``aux``.
 
 Reference: Betaflight, src/main/msp/msp.c (MSP_STATUS) and msp_box.c (MSP_BOXIDS); src/main/fc/runtime_config.h and .c;
 https://betaflight.com/docs/wiki/guides/current/Arming-Sequence-And-Safety.
@@ -50,17 +50,17 @@ _REASONS = (
     ("MOTOR_PROTO", "no motor protocol is set"),
 )
 _SWITCH = ("ARM_SWITCH", "the arm switch was on before it could arm: off, and on again")
-_HEAD = 16  # bytes before the count of further modes, with it
+_HEAD = 16  # bytes up to and including the number of further bytes of modes
 _LEAST = _HEAD + 5
 
 
 class FlightControllerStatus(NamedTuple):
-    """What a flight controller says of itself.
+    """The status of a flight controller.
 
     Args:
-        modes: Which are on, a bit each: the first is ARM, of the others MSP_BOXIDS tells.
-        flags: What keeps it from arming, one bit each.
-        total: How many flags it has.
+        modes: Which are on, one bit each: the first is ARM, the others are given by MSP_BOXIDS.
+        flags: What prevents arming, one bit each.
+        total: Number of flags that exist.
     """
 
     modes: int
@@ -74,12 +74,12 @@ class FlightControllerStatus(NamedTuple):
 
     @property
     def names(self) -> tuple[str, ...]:
-        """What keeps it from arming, by the names of its CLI."""
+        """What prevents arming, by the names of its CLI."""
         return tuple(name for name, _ in self._reasons())
 
     @property
     def words(self) -> str:
-        """What keeps it from arming, for a person; empty if nothing does."""
+        """What prevents arming, for a person; empty if nothing does."""
         return "; ".join(f"{name}: {reason}" for name, reason in self._reasons())
 
     def _reasons(self) -> list[tuple[str, str]]:
@@ -92,7 +92,7 @@ class FlightControllerStatus(NamedTuple):
 
 
 def read_status(payload: bytes) -> FlightControllerStatus | None:
-    """Return what the payload of an MSP_STATUS says; None if it is too short to be one."""
+    """Return the status in the payload of an MSP_STATUS; None if it is too short to be one."""
     if len(payload) < _LEAST:
         return None
     at = _HEAD + (payload[_HEAD - 1] & 0x0F)
@@ -103,34 +103,34 @@ def read_status(payload: bytes) -> FlightControllerStatus | None:
 
 
 NOT_READY = frozenset({"NOGYRO", "ANGLE", "BOOTGRACE", "CALIB", "CLI"})
-"""What keeps a firmware from arming while it boots; the rest is up to who flies it."""
+"""Flags that prevent arming while a firmware boots; the others depend on its pilot."""
 
 REQUEST = b"$M<" + bytes([0, STATUS, STATUS])
-"""Asks for the status: 6 bytes of MSP version 1."""
+"""Request of the status: 6 bytes of MSP version 1."""
 
 BOXIDS_REQUEST = b"$M<" + bytes([0, BOXIDS, BOXIDS])
-"""Asks which modes there are, in the order of the status' bits."""
+"""Request of the list of modes, in the order of the status bits."""
 
 
 class SerialOverTcp:
-    """The first serial port of a firmware on this machine, without waiting: connected anew wherever it is closed.
+    """A non-blocking connection to the first serial port of a firmware on this machine, reopened whenever it closes.
 
     The firmware takes one connection at a time, and closes another at once.
 
     Args:
-        port: TCP.
-        host: Of this machine.
+        port: TCP port.
+        host: Address of this machine.
     """
 
-    _AGAIN = 0.5  # s until it is tried again
+    _AGAIN = 0.5  # s between attempts to connect
 
     def __init__(self, port: int, host: str = "127.0.0.1") -> None:
         self._address = (host, port)
         self._socket: socket.socket | None = None
-        self._next = 0.0  # when to try, s of ``time.monotonic``
+        self._next = 0.0  # when to connect next, s of ``time.monotonic``
 
     def write(self, data: bytes) -> bool:
-        """Write bytes; return whether they went out."""
+        """Write bytes; return whether they were sent."""
         connection = self._connect()
         if connection is None:
             return False
@@ -143,7 +143,7 @@ class SerialOverTcp:
             return False
 
     def read(self) -> bytes:
-        """Return what has come back, if anything."""
+        """Return the received bytes, if any."""
         if self._socket is None:
             return b""
         try:
@@ -168,7 +168,7 @@ class SerialOverTcp:
             self._socket = socket.socket(socket.AF_INET, socket.SOCK_STREAM)
             self._socket.setblocking(False)
             self._socket.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
-            self._socket.connect_ex(self._address)  # where nobody is, the first write says so
+            self._socket.connect_ex(self._address)  # if nobody listens, the first write fails
         return self._socket
 
     def _lose(self) -> None:

@@ -1,14 +1,14 @@
 """Links to vehicles, by name.
 
-| name | goes over | says | needs | hears the battery by | and the IMU |
+| name | transport | sends | needs | battery from | IMU from |
 |---|---|---|---|---|---|
 | ``udp``, ``simulated`` | UDP | setpoints in SI units | port | | `hil.imu` |
-| ``betaflight_sitl`` | UDP, and TCP for MSP | channels | rates, thrust | | RAW_IMU, which it asks for by MSP |
+| ``betaflight_sitl`` | UDP, and TCP for MSP | channels | rates, thrust | | RAW_IMU, requested by MSP |
 | ``crsf`` | serial port | channels | device, rates, thrust | BATTERY_SENSOR | |
 | ``sbus`` | serial port | channels | device, rates, thrust | | |
-| ``msp`` | serial port, or TCP | channels | device or port, rates, thrust | BATTERY_STATE, asked for | RAW_IMU |
+| ``msp`` | serial or TCP | channels | device or port, rates, thrust | BATTERY_STATE, requested | RAW_IMU |
 | ``msp_override`` | likewise | the four sticks | likewise | likewise | likewise |
-| ``mavlink`` | UDP, or serial port | rates, motor command | port or device, thrust | BATTERY_STATUS, SYS_STATUS | two |
+| ``mavlink`` | UDP or serial | rates, motor command | port or device, thrust | BATTERY_STATUS, SYS_STATUS | `mavlink` |
 """
 
 from __future__ import annotations
@@ -43,21 +43,21 @@ from dreamer_racing.settings import given
 
 @dataclass(frozen=True)
 class LinkConfig:
-    """Which link, and what it needs.
+    """The choice of a link, and its settings.
 
     Attributes:
         name: One of `LINKS`.
-        host: To send to over UDP or TCP.
+        host: Host to send to over UDP or TCP.
         port: UDP port, for ``betaflight_sitl`` 9004 unless given; for ``msp`` and ``msp_override`` without a device the
             TCP port of a firmware on this machine.
         device: Path of a serial port.
-        baud: Bits a second of the serial port; the protocol's own unless given.
-        rates: What the flight controller makes of the sticks.
-        thrust: What motors and battery make of the throttle.
+        baud: Bits a second of the serial port; by default the protocol's.
+        rates: Map from sticks to body rates.
+        thrust: Map from throttle to thrust.
         arm_channel: Index of the channel that arms, 4 for AUX1.
-        imu: Whether what the IMU tells is to be heard.
+        imu: Whether to receive IMU samples.
         serial_port: For ``betaflight_sitl``: TCP port of the firmware's MSP.
-        rate: Commands a second, to refuse a serial port that is too slow for them; None: whatever comes.
+        rate: Commands a second, to refuse a serial port that is too slow for them; None: not checked.
 
     Raises:
         ValueError: ``arm_channel`` is no switch.
@@ -80,11 +80,11 @@ class LinkConfig:
 
 
 def make_link(config: LinkConfig) -> TransportLink:
-    """Make a link and open what it goes over.
+    """Make a link and open its transport.
 
     Raises:
-        ValueError: There is no link of that name, something that it needs is not given or cannot be, or a serial port
-            is too slow for so many commands.
+        ValueError: There is no link of that name, a setting that it needs is missing or impossible, or a serial port is
+            too slow for that many commands.
         OSError: Device or host cannot be used.
         ImportError: A package is missing; the message says how to install it.
 
@@ -113,7 +113,7 @@ def make_link(config: LinkConfig) -> TransportLink:
 
 
 def _check_speed(link: TransportLink, config: LinkConfig) -> None:
-    """Refuse a wire on which commands would queue up and be dropped."""
+    """Refuse a serial port so slow that commands would queue up and be dropped."""
     if config.device is None or config.rate is None:
         return
     settings = _wire_settings(config)
@@ -141,7 +141,7 @@ def _betaflight_sitl(config: LinkConfig) -> TransportLink:
 def _radio(
     encode: Callable[[Sequence[float]], bytes], telemetry: Callable[[], Telemetry | None] = lambda: None
 ) -> Callable[[LinkConfig], TransportLink]:
-    """Return what makes the link of a radio's receiver at a serial port."""
+    """Return a factory of links that act as a radio's receiver at a serial port."""
 
     def make(config: LinkConfig) -> TransportLink:
         rates, thrust = _maps(config)
@@ -151,7 +151,7 @@ def _radio(
 
 
 def _msp(config: LinkConfig, override: bool = False) -> TransportLink:
-    """Make the link to a flight controller that hears MSP alone, or beside a receiver whose sticks it overrides."""
+    """Make the link to a flight controller whose only receiver is MSP, or whose receiver's sticks MSP overrides."""
     rates, thrust = _maps(config)
     simulated = config.device is None and config.port is not None
     wire = TcpTransport(SerialOverTcp(_port(config), config.host)) if simulated else _wire(config)
@@ -176,13 +176,13 @@ LINKS: dict[str, Callable[[LinkConfig], TransportLink]] = {
     "msp_override": partial(_msp, override=True),
     "mavlink": _mavlink,
 }
-"""What makes a link, by its name."""
+"""Factory of each link, by name."""
 
 HEARING = ("crsf", "msp", "msp_override", "mavlink")
-"""Links that hear of the battery."""
+"""Links that receive the battery's voltage."""
 
 FEELING = ("udp", "simulated", "betaflight_sitl", "msp", "msp_override", "mavlink")
-"""Links that hear what the IMU tells."""
+"""Links that can receive IMU samples."""
 
 
 def _maps(config: LinkConfig) -> tuple[RateMap, ThrustMap]:

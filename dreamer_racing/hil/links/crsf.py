@@ -5,7 +5,7 @@ CRC-8 over kind and channels.
 
 Betaflight reads 1811 − 172 ticks as 2012 − 988 µs exactly, which is up to 1 µs more than meant, and 0.8 µs at centre.
 
-What comes back, big endian: address, length 0A, kind 08, voltage u16 (0.1 V), current u16 (0.1 A), used capacity u24
+Telemetry, big endian: address, length 0A, kind 08, voltage u16 (0.1 V), current u16 (0.1 A), used capacity u24
 (mAh), remaining u8 (%), and the CRC-8. With Betaflight's ``report_cell_voltage`` it is the voltage of one cell.
 
 Reference: github.com/crsf-wg/crsf, wiki, Message-Format, CRSF_FRAMETYPE_RC_CHANNELS_PACKED and
@@ -23,9 +23,9 @@ HEADER = b"\xc8\x18\x16"
 FRAME_SIZE = len(HEADER) + packed.SIZE + 1
 """Bytes of a frame: 26."""
 ADDRESSES = (0xC8, 0xEA, 0xEC, 0xEE)
-"""With which frames begin: of the flight controller, the handset, the receiver and the transmitter's module."""
+"""First bytes of frames: of flight controller, handset, receiver and transmitter module."""
 BATTERY_SENSOR, _BATTERY_PAYLOAD = 0x08, 8
-_SHORTEST, _LONGEST = 2, 62  # lengths that a frame may give
+_SHORTEST, _LONGEST = 2, 62  # allowed values of the length byte
 _POLYNOMIAL = 0xD5  # DVB-S2
 
 
@@ -36,7 +36,7 @@ def encode_crsf(channels: Sequence[float]) -> bytes:
 
 
 def decode_crsf(frame: bytes) -> tuple[float, ...] | None:
-    """Return the 16 channels, in µs, of a frame; None if it is none, or damaged."""
+    """Return the 16 channels, in µs, of a frame; None if it is not such a frame, or damaged."""
     if len(frame) != FRAME_SIZE or not frame.startswith(HEADER) or crc8(frame[2:-1]) != frame[-1]:
         return None
     return packed.unpack(frame[len(HEADER) : -1])
@@ -50,7 +50,7 @@ class CrsfTelemetry(Telemetry):
         self._frames = FrameReader(size_of, is_whole)
 
     def read(self, data: bytes) -> list[float]:
-        """Take in bytes; return the voltages in them, V, in steps of 0.1 V."""
+        """Parse bytes; return the voltages in them, V, in steps of 0.1 V."""
         damaged, voltages = self._frames.rejected, []
         for frame in self._frames.read(data):
             payload = frame[3:-1]
@@ -65,7 +65,7 @@ class CrsfTelemetry(Telemetry):
 
 
 def size_of(data: bytes) -> int | None:
-    """Return the size of the frame that begins the data, as `FrameReader` asks."""
+    """Return the size of the frame at the start of the data, as `FrameReader` requires."""
     if data[0] not in ADDRESSES:
         return None
     if len(data) < 2:

@@ -1,4 +1,4 @@
-"""What all links are made of: a way to write a command down, and a transport that takes the bytes without waiting."""
+"""Base classes of links, which encode commands and send the bytes over a non-blocking transport."""
 
 from __future__ import annotations
 
@@ -15,22 +15,22 @@ from dreamer_racing.hil.sticks import FIRST_SWITCH, RateMap, ThrustMap, channels
 from dreamer_racing.hil.vehicle import Command, at_rest
 
 ASK_EVERY = 5
-"""Commands from one request for telemetry to the next, where a link has to ask [choice]: 5 to 10 a second."""
+"""Commands per telemetry request, for links that have to ask [choice]: 5 to 10 requests a second."""
 
 
 class Transport(Protocol):
-    """Takes bytes to where they are heard, and gives those that come back."""
+    """Sends bytes to a vehicle, and receives those that come back."""
 
     def write(self, data: bytes) -> bool:
-        """Hand over bytes without waiting; return whether they were taken, all of them.
+        """Send bytes without blocking; return whether all of them were accepted.
 
         Raises:
-            OSError: The device is gone; what may pass by itself is not raised.
+            OSError: The device is gone; transient errors are not raised.
         """
         ...
 
     def discard(self) -> None:
-        """Throw away what was written and has not left yet.
+        """Discard bytes that were written but not sent yet.
 
         Raises:
             OSError: The device is gone.
@@ -38,7 +38,7 @@ class Transport(Protocol):
         ...
 
     def read(self) -> Iterator[tuple[float, bytes]]:
-        """Yield what has come back, as `Inlet.read` does.
+        """Yield the received bytes, as `Inlet.read` does.
 
         Raises:
             OSError: The device is gone.
@@ -46,21 +46,21 @@ class Transport(Protocol):
         ...
 
     def close(self) -> None:
-        """Give back socket or device; may be called twice."""
+        """Close the socket or device; may be called twice."""
         ...
 
 
 class TransportLink(ABC):
-    """A `Link` over a transport; a subclass says how a command is written.
+    """A `Link` over a transport; subclasses encode the commands.
 
     Args:
-        transport: Takes the bytes; closed with the link.
-        thrust: What motors and battery make of their command; None where thrust is sent as it is.
-        telemetry: Reads what comes back; None if nothing does.
+        transport: Sends the bytes; closed with the link.
+        thrust: Map from motor command to thrust; None if thrust is sent in SI units.
+        telemetry: Parses received bytes; None if there are none.
 
     Attributes:
-        dropped: Commands so far that did not go out, because a buffer was full or nobody listened.
-        thrust: As given, with the voltage of now.
+        dropped: Number of commands so far that were not sent, because a buffer was full or nobody listened.
+        thrust: As given, at the present voltage.
     """
 
     def __init__(
@@ -69,21 +69,21 @@ class TransportLink(ABC):
         self.dropped = 0
         self.thrust = thrust
         self._transport, self._telemetry = transport, telemetry
-        self._armed = False  # whether the last command was
+        self._armed = False  # whether the last command was armed
         self._felt: list[ImuReading] = []
 
     @property
     def rejected(self) -> int:
-        """What has come back so far and was not understood, see `Telemetry`."""
+        """Number of received frames that could not be read, see `Telemetry`."""
         return 0 if self._telemetry is None else self._telemetry.rejected
 
     @property
     def refusal(self) -> str:
-        """Why the flight controller does not fly what it is told, or would not; empty as far as is known."""
+        """Why the flight controller does not follow commands, or would not if armed; empty if no reason is known."""
         return "" if self._telemetry is None else self._telemetry.refusal(self._armed)
 
     def listen(self) -> list[Reading]:
-        """Return the battery's voltages that have come back since the last call, oldest first, without waiting.
+        """Return the battery voltages received since the last call, oldest first, without blocking.
 
         Raises:
             OSError: The device is gone.
@@ -98,15 +98,15 @@ class TransportLink(ABC):
         return readings
 
     def feel(self) -> list[ImuReading]:
-        """Return what the vehicle's IMU told until the last `listen`, oldest first."""
+        """Return the IMU samples received up to the last `listen`, oldest first."""
         felt, self._felt = self._felt, []
         return felt
 
     def reckon_with(self, voltage: float) -> None:
-        """Let the thrust map reckon with a voltage, V, from now on, or with the nearest that it can (`ThrustMap.at`).
+        """Set the thrust map's voltage, V, or the nearest that it can have (`ThrustMap.at`).
 
-        A reading in flight never raises: beyond what `ThrustMap.check` allows it is the last that is allowed which
-        counts, and what is not finite counts for nothing.
+        A reading in flight never raises: one beyond what `ThrustMap.check` allows is clipped, one that is not finite is
+        ignored.
         """
         if self.thrust is not None and self.thrust.voltage != voltage:
             self.thrust = self.thrust.at(voltage)
@@ -118,15 +118,15 @@ class TransportLink(ABC):
 
     @abstractmethod
     def encode(self, command: Command) -> bytes:
-        """Return the bytes that say a command: `at_rest`, or an armed one whose numbers are finite."""
+        """Return the bytes of a command: `at_rest`, or an armed one with finite numbers."""
 
     def send(self, command: Command) -> bytes:
-        """Send a command now, without waiting; return the bytes that went out, none if it was dropped.
+        """Send a command without blocking; return the bytes sent, none if it was dropped.
 
-        The first that disarms overtakes armed ones that still wait.
+        The first disarming command discards armed ones that still wait.
 
         Raises:
-            ValueError: An armed command whose setpoint is not finite: no vehicle could be told that.
+            ValueError: The command is armed and its setpoint is not finite.
             OSError: The device is gone.
         """
         thrust, rates = command.setpoint
@@ -142,22 +142,22 @@ class TransportLink(ABC):
         return b""
 
     def close(self) -> None:
-        """Give back socket or device; may be called twice."""
+        """Close the socket or device; may be called twice."""
         self._transport.close()
 
 
 class ChannelLink(TransportLink):
-    """Says commands as the 16 channels of a radio.
+    """Sends commands as the 16 channels of a radio.
 
     Args:
-        transport: Takes the bytes.
-        encode_channels: Writes 16 channels, in µs, in the protocol's form.
-        rates: What the flight controller makes of the sticks.
-        thrust: What it makes of the throttle.
+        transport: Sends the bytes.
+        encode_channels: Encodes 16 channels, in µs, in the protocol's format.
+        rates: Map from sticks to body rates.
+        thrust: Map from throttle to thrust.
         arm_channel: Index of the switch that arms, see `channels`.
         telemetry: See `TransportLink`.
-        request: Asks for telemetry; goes out with the first of every `ASK_EVERY` commands.
-        always: Asks for what is wanted at each command.
+        request: Telemetry request, sent with the first of every `ASK_EVERY` commands.
+        always: Request sent with every command.
     """
 
     thrust: ThrustMap
@@ -178,7 +178,7 @@ class ChannelLink(TransportLink):
         self._request, self._always, self._encoded = request, always, 0
 
     def encode(self, command: Command) -> bytes:
-        """Return the frame of a command, and the request where that is due."""
+        """Return the frame of a command, with the requests that are due."""
         frame = self._encode_channels(channels(command, self._rates, self.thrust, self._arm_channel))
         due = self._encoded % ASK_EVERY == 0
         self._encoded += 1

@@ -1,17 +1,17 @@
 """MAVLink 2 to PX4: SET_ATTITUDE_TARGET with body rates and thrust, and the command that arms.
 
-The vehicle must be in the mode in which it obeys (offboard); a person puts it there, by radio. Not for ArduPilot, which
-takes thrust for a climb rate unless its ``GUID_OPTIONS`` say otherwise, and hovers on where commands stop.
+The vehicle must be in offboard mode; a person switches it there, by radio. Not for ArduPilot, which takes thrust for a
+climb rate unless its ``GUID_OPTIONS`` say otherwise, and keeps hovering when commands stop.
 
 Disarming is forced: it stops the motors in the air too, as the arm switch of the other links does. Unlike that switch
-it counts in every mode, so none is sent before this link has armed the vehicle: whoever else flies it goes on.
+it works in every mode, so it is not sent before this link has armed the vehicle: a flight of another pilot goes on.
 
-Thrust is sent as the motors' command (`ThrustMap.to_motor`), which PX4 passes on as it is with ``THR_MDL_FAC = 0``.
+Thrust is sent as the motors' command (`ThrustMap.to_motor`), which PX4 passes on unchanged with ``THR_MDL_FAC = 0``.
 
-The battery's voltage comes back in BATTERY_STATUS (``id`` 0; mV of each cell, 65535 for those that are not there; a
-voltage that is only known as a whole stands in the first) or in SYS_STATUS (mV; 65535: not known). Gyro and
-accelerometer come back in HIGHRES_IMU (rad/s, m/s², FRD) or SCALED_IMU (mrad/s, mG): the vehicle must be set to send
-one of them as often as commands come.
+The battery's voltage comes in BATTERY_STATUS (``id`` 0; mV of each cell, 65535 for missing ones; if only the voltage of
+the whole is known, it is in the first) or in SYS_STATUS (mV; 65535: unknown). Gyro and accelerometer come in
+HIGHRES_IMU (rad/s, m/s², FRD) or SCALED_IMU (mrad/s, mG): the vehicle must be set to send one of them as often as
+commands come.
 
 Reference: mavlink.io/en/messages/common.html.
 """
@@ -34,25 +34,25 @@ from dreamer_racing.hil.vehicle import GRAVITY, Command, Setpoint
 IGNORE_ATTITUDE = 128
 """ATTITUDE_TARGET_TYPEMASK: rates and thrust count, the attitude does not."""
 FORCE = 21196.0
-"""Second number of COMPONENT_ARM_DISARM: disarm wherever the vehicle is."""
+"""Second parameter of COMPONENT_ARM_DISARM: disarm even in flight."""
 STANDARD_GRAVITY = 9.80665
-"""m/s², of a G in SCALED_IMU."""
+"""m/s² per G in SCALED_IMU."""
 UNKNOWN = 65535
-"""mV, of a voltage that is not known."""
-_LONGEST = Setpoint(GRAVITY, np.ones(3))  # zeros at a message's end are left out on the wire
+"""mV, value of an unknown voltage."""
+_LONGEST = Setpoint(GRAVITY, np.ones(3))  # without zeros, which the wire omits at a message's end
 ARM_TRIES = 5
-"""Messages that arm, from when a command is armed first: one may be lost, but a vehicle that has disarmed itself later
-must not be armed again [choice]."""
+"""Arm messages sent from the first armed command on: one may be lost, but a vehicle that has disarmed itself later must
+not be armed again [choice]."""
 
 
 class MavlinkLink(TransportLink):
     """Sends attitude targets, and arms and disarms.
 
     Args:
-        transport: Takes the bytes.
-        thrust: What the motors make of their command; ``idle`` and ``min_check`` play no part.
-        system: Number of the vehicle.
-        component: Number of its autopilot.
+        transport: Sends the bytes.
+        thrust: Map from motor command to thrust; ``idle`` and ``min_check`` are not used.
+        system: System ID of the vehicle.
+        component: Component ID of its autopilot.
 
     Raises:
         ImportError: pymavlink is not installed.
@@ -66,7 +66,7 @@ class MavlinkLink(TransportLink):
         self._target = system, component
         self._sender = self._common.MAVLink(None, system, self._common.MAV_COMP_ID_ONBOARD_COMPUTER)
         self._armed_for = 0  # commands in a row
-        self._has_armed = False  # whether this link ever said so: what it did not arm is not its own to disarm
+        self._has_armed = False  # whether this link ever armed; it disarms only what it has armed
 
     @property
     def longest(self) -> int:
@@ -74,7 +74,7 @@ class MavlinkLink(TransportLink):
         return len(self._switch(armed=True) + self._attitude_target(Command(True, _LONGEST)))
 
     def encode(self, command: Command) -> bytes:
-        """Return the messages of a command: what arms or disarms where that is due, and the target."""
+        """Return the messages of a command: arm or disarm, if due, and the attitude target."""
         self._armed_for = self._armed_for + 1 if command.armed else 0
         self._has_armed = self._has_armed or command.armed
         due = self._has_armed and self._armed_for <= ARM_TRIES
@@ -108,10 +108,10 @@ class MavlinkLink(TransportLink):
 
 
 class MavlinkTelemetry(Telemetry):
-    """Reads BATTERY_STATUS, of the first battery, SYS_STATUS, and the IMU's messages, by pymavlink.
+    """Reads BATTERY_STATUS (of the first battery), SYS_STATUS and the IMU's messages, by pymavlink.
 
     Args:
-        system: Number of the vehicle: what others say is passed over.
+        system: System ID of the vehicle; messages of others are ignored.
 
     Raises:
         ImportError: pymavlink is not installed.
@@ -124,7 +124,7 @@ class MavlinkTelemetry(Telemetry):
         self._parser.robust_parsing = True  # damaged messages come out as BAD_DATA
 
     def read(self, data: bytes) -> list[float]:
-        """Take in bytes; return the voltages in them, V, oldest first."""
+        """Parse bytes; return the voltages in them, V, oldest first."""
         voltages = []
         for message in self._parser.parse_buffer(data) or []:
             kind = message.get_type()
@@ -142,7 +142,7 @@ class MavlinkTelemetry(Telemetry):
 
 
 def _is_another(message: Any) -> bool:
-    """Whether a message is of a battery that is not the first."""
+    """Return whether a message is of another battery than the first."""
     return message.get_type() == "BATTERY_STATUS" and message.id != 0
 
 
@@ -159,11 +159,11 @@ VOLTAGES: dict[str, Callable[[Any], float | None]] = {
     "BATTERY_STATUS": _of_battery_status,
     "SYS_STATUS": _of_sys_status,
 }
-"""What reads the voltage, V, of a message by its name; None: it says nothing of it."""
+"""Reader of the voltage, V, by message name; it returns None if the voltage is unknown."""
 
 
 def _of_imu(message: Any, gyro: float, force: float) -> np.ndarray | None:
-    """Return a sample, FLU, of FRD numbers in units of so many rad/s and m/s²."""
+    """Return an FLU sample from FRD values in units of ``gyro`` rad/s and ``force`` m/s²."""
     return make_sample(
         (gyro * message.xgyro, -gyro * message.ygyro, -gyro * message.zgyro),
         (force * message.xacc, -force * message.yacc, -force * message.zacc),
@@ -174,4 +174,4 @@ SAMPLES: dict[str, Callable[[Any], np.ndarray | None]] = {
     "HIGHRES_IMU": lambda message: _of_imu(message, 1.0, 1.0),
     "SCALED_IMU": lambda message: _of_imu(message, 1e-3, 1e-3 * STANDARD_GRAVITY),
 }
-"""What reads the IMU's message by its name; None: its numbers are none."""
+"""Reader of the IMU's sample, by message name; it returns None if numbers are implausible."""

@@ -1,18 +1,18 @@
 """MSP version 1 (MultiWii serial protocol): SET_RAW_RC, BATTERY_STATE, RAW_IMU and STATUS, over a serial port or TCP.
 
-38 bytes, little endian: ``b"$M<"``, size 32 of the payload, code 200, 16 u16 µs, and all after ``<`` combined by XOR.
-In Betaflight: ``feature RX_MSP``, and at least five messages a second. Where a receiver stays and MSP overrides its
-sticks, only these four are sent, 14 bytes: what is not there cannot arm.
+A channel message has 38 bytes, little endian: ``b"$M<"``, size 32 of the payload, code 200, 16 u16 µs, and the XOR of
+all bytes after ``<``. Betaflight needs ``feature RX_MSP``, and at least five messages a second. If MSP overrides the
+sticks of a receiver, only these four are sent, 14 bytes: without an arm channel they cannot arm.
 
-What the flight controller says of itself (101, `hil.betaflight.status`) is asked for with the battery.
+The flight controller's status (101, `hil.betaflight.status`) is requested with the battery.
 
-The battery is asked for (code 130, no payload). The answer begins with ``b"$M>"``; its payload of 11 bytes is: cells u8
-(0: no battery), capacity u16 (mAh), voltage u8 (0.1 V), drawn u16 (mAh), current i16 (0.01 A), alert u8, and voltage
-u16 (0.01 V), which is the one that is read. Releases before 4.0 lack it.
+The battery is requested by code 130 without payload. The answer begins with ``b"$M>"``; its payload of 11 bytes is:
+cells u8 (0: no battery), capacity u16 (mAh), voltage u8 (0.1 V), drawn u16 (mAh), current i16 (0.01 A), alert u8, and
+voltage u16 (0.01 V), which is the one that is read. Releases before 4.0 lack it.
 
-The IMU is asked for likewise (code 102). The payload of the answer, 18 bytes, is nine i16: acceleration, body rates and
-magnetic field, each x, y, z; the first two are in FLU, with signs as a 4.6 that was built for a computer sends them.
-Body rates are raw counts of ±2000 deg/s, 16.4 to a deg/s, and 512 of acceleration are 1 g (256 in such a build).
+The IMU is requested likewise (code 102). The payload of the answer, 18 bytes, is nine i16: acceleration, body rates and
+magnetic field, each x, y, z; the first two are in FLU, with the signs of a 4.6 that was built for a computer (SITL).
+Body rates are raw counts of ±2000 deg/s, 16.4 per deg/s, and 512 counts of acceleration are 1 g (256 in SITL).
 
 Reference: Betaflight, src/main/msp/msp_serial.c, msp_protocol.h and msp.c (MSP_BATTERY_STATE, MSP_RAW_IMU).
 """
@@ -44,18 +44,18 @@ from dreamer_racing.hil.links.telemetry import FrameReader, Telemetry
 
 SET_RAW_RC, BATTERY_STATE, RAW_IMU = 200, 130, 102
 BATTERY_REQUEST = b"$M<" + bytes([0, BATTERY_STATE, BATTERY_STATE])
-"""Asks for the battery's state: 6 bytes."""
+"""Request of the battery's state: 6 bytes."""
 MSP_REQUEST = BATTERY_REQUEST + REQUEST
-"""Asks for all that is heard of a flight controller now and then."""
+"""Request of battery and status, sent every `ASK_EVERY` commands."""
 OVERRIDE_REQUEST = MSP_REQUEST + BOXIDS_REQUEST
-"""The same, with which modes there are."""
+"""The same, and a request of the list of modes."""
 _BATTERY_PAYLOAD = 11
 IMU_REQUEST = b"$M<" + bytes([0, RAW_IMU, RAW_IMU])
-"""Asks for what the IMU tells: 6 bytes."""
+"""Request of an IMU sample: 6 bytes."""
 GYRO_COUNTS = 16.4
-"""To a deg/s."""
+"""Counts of the gyro per deg/s."""
 G_COUNTS, G_COUNTS_SITL = 512.0, 256.0
-"""To 9.81 m/s²: of sensors, and of a firmware that was built for a computer."""
+"""Counts of acceleration per 9.81 m/s²: of sensors, and of a firmware that was built for a computer."""
 _IMU = struct.Struct("<6h")
 _STICKS = 4
 FRAME_SIZE = 38
@@ -63,7 +63,7 @@ FRAME_SIZE = 38
 
 
 def encode_msp(channels: Sequence[float]) -> bytes:
-    """Return the message of channels in µs, rounded to 1 µs: 16 as a rule."""
+    """Return the message of channels, usually 16, in µs, rounded to 1 µs."""
     words = struct.pack(f"<{len(channels)}H", *(round(value) for value in channels))
     frame = b"$M<" + bytes([len(words), SET_RAW_RC]) + words + b"\0"
     return frame[:-1] + bytes([_checksum(frame)])
@@ -75,7 +75,7 @@ def encode_sticks(channels: Sequence[float]) -> bytes:
 
 
 def decode_msp(frame: bytes) -> tuple[float, ...] | None:
-    """Return the channels, in µs, of a message; None if it is none, or damaged."""
+    """Return the channels, in µs, of a message; None if it is not such a message, or damaged."""
     size = len(frame) - 6
     if (
         size < 0
@@ -91,12 +91,12 @@ class MspTelemetry(Telemetry):
     """Reads answers to `OVERRIDE_REQUEST` and `IMU_REQUEST`.
 
     Args:
-        g_counts: Of acceleration, to 9.81 m/s².
-        override: Whether a receiver stays, and its pilot arms, hands over and takes back.
+        g_counts: Counts of acceleration per 9.81 m/s².
+        override: Whether MSP overrides a receiver, whose pilot arms, hands over and takes back.
 
     Attributes:
-        status: What the flight controller last said of itself; None: nothing.
-        boxes: Numbers of its modes, in the order of the status' bits; None: it has not said.
+        status: Last status of the flight controller; None before the first.
+        boxes: Numbers of its modes, in the order of the status bits; None if not received yet.
     """
 
     def __init__(self, g_counts: float = G_COUNTS, override: bool = False) -> None:
@@ -108,7 +108,7 @@ class MspTelemetry(Telemetry):
         self._scale = math.radians(1.0 / GYRO_COUNTS), GRAVITY / g_counts
 
     def read(self, data: bytes) -> list[float]:
-        """Take in bytes; return the voltages in them, V, in steps of 0.01 V."""
+        """Parse bytes; return the voltages in them, V, in steps of 0.01 V."""
         damaged, voltages = self._frames.rejected, []
         for frame in self._frames.read(data):
             kind, payload, answered = frame[4], frame[5:-1], frame[2] == ord(">")
@@ -128,7 +128,7 @@ class MspTelemetry(Telemetry):
         return voltages
 
     def refusal(self, armed: bool) -> str:
-        """Return why the flight controller does not fly what it is told, or would not; empty as far as is known."""
+        """Return why the flight controller does not, or would not, follow commands; empty if no reason is known."""
         status = self.status
         if self._override:
             return self._taken_back()
@@ -137,7 +137,7 @@ class MspTelemetry(Telemetry):
         return status.words or ("it has not armed, and gives no reason: is arm_channel= its switch?" if armed else "")
 
     def _taken_back(self) -> str:
-        """Return why the pilot does not let it fly; empty if he does."""
+        """Return why the pilot or the modes prevent the override; empty if nothing does."""
         status, boxes = self.status, self.boxes
         if status is None or boxes is None:
             return "nothing was heard of it"
@@ -151,7 +151,7 @@ class MspTelemetry(Telemetry):
         return "it levels itself: switch ANGLE and HORIZON off" if on & {ANGLE, HORIZON} else ""
 
     def _sample(self, payload: bytes) -> np.ndarray | None:
-        """Return body rates, rad/s, and specific force, m/s², FLU, of a RAW_IMU; None: it is too short."""
+        """Return body rates, rad/s, and specific force, m/s², FLU, of a RAW_IMU; None if too short or implausible."""
         if len(payload) < _IMU.size:
             return None
         counts, (rate, force) = _IMU.unpack_from(payload), self._scale
@@ -159,14 +159,14 @@ class MspTelemetry(Telemetry):
 
 
 def _voltage(payload: bytes) -> float | None:
-    """Return the voltage of a BATTERY_STATE, V; None: it is too short, or there is no battery."""
+    """Return the voltage of a BATTERY_STATE, V; None if it is too short, or there is no battery."""
     if len(payload) < _BATTERY_PAYLOAD or payload[0] == 0:
         return None
     return int.from_bytes(payload[9:11], "little") / 100
 
 
 def size_of(data: bytes) -> int | None:
-    """Return the size of the frame that begins the data, as `FrameReader` asks."""
+    """Return the size of the frame at the start of the data, as `FrameReader` requires."""
     if data[:3] not in (b"$", b"$M", b"$M>", b"$M!"):
         return None
     return data[3] + 6 if len(data) > 3 else 0

@@ -19,10 +19,10 @@ _LARGEST = 2**BITS - 1
 
 
 def pack(channels: Sequence[float]) -> bytes:
-    """Return the 22 bytes of 16 channels in µs, rounded to 5/8 µs; beyond 880 to 2159 µs, the nearest that fits.
+    """Return the 22 bytes of 16 channels in µs, rounded to 5/8 µs; clipped to 880 to 2159 µs.
 
     Raises:
-        ValueError: There are not 16.
+        ValueError: There are not 16 channels.
     """
     if len(channels) != CHANNELS:
         raise ValueError(f"{len(channels)} channels: a frame has {CHANNELS}.")

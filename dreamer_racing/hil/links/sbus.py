@@ -1,7 +1,7 @@
-"""SBUS (Futaba): 25 bytes, 0F, 22 bytes of `packed` channels, one of flags, and 00.
+"""SBUS (Futaba): 25 bytes, which are 0F, 22 bytes of `packed` channels, one of flags, and 00.
 
 The signal is inverted: either the adapter inverts it, or the flight controller is told not to (``serialrx_inverted``).
-A frame has no checksum: what a wire damages is for the parity bit of each byte to find.
+A frame has no checksum; only the parity bit of each byte detects damage.
 
 Reference: Betaflight, src/main/rx/sbus.c and sbus_channels.c.
 """
@@ -17,16 +17,16 @@ HEADER, FOOTER = 0x0F, 0x00
 FRAME_LOST, FAILSAFE = 1 << 2, 1 << 3
 FRAME_SIZE = packed.SIZE + 3
 """Bytes of a frame: 25."""
-_FLAGS = 0x0F  # the two switches 17 and 18, and those above
+_FLAGS = 0x0F  # of channels 17 and 18, and the two above
 
 
 class SbusFrame(NamedTuple):
-    """What a frame says.
+    """The content of a frame.
 
     Args:
         channels: (16,) µs.
         frame_lost: Whether the receiver missed the last frame of its radio.
-        failsafe: Whether it has heard nothing for long: channels are made up then.
+        failsafe: Whether it has received nothing for long; channels are substitutes then.
     """
 
     channels: tuple[float, ...]
@@ -41,7 +41,7 @@ def encode_sbus(channels: Sequence[float], frame_lost: bool = False, failsafe: b
 
 
 def decode_sbus(frame: bytes) -> SbusFrame | None:
-    """Return what a frame says; None if it is none."""
+    """Return a frame's content; None if it is not an SBUS frame."""
     if len(frame) != FRAME_SIZE or frame[0] != HEADER or frame[-1] != FOOTER or frame[-2] & ~_FLAGS:
         return None
     return SbusFrame(packed.unpack(frame[1:-2]), bool(frame[-2] & FRAME_LOST), bool(frame[-2] & FAILSAFE))

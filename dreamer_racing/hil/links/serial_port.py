@@ -1,4 +1,4 @@
-"""Serial ports: the settings of each protocol, and a port that never waits, to write to and to read from."""
+"""Serial ports: the settings of each protocol, and a non-blocking port to write to and to read from."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from dreamer_racing.commands import install_extra
 
 
 class SerialSettings(NamedTuple):
-    """How bytes go over a wire: 8 bits each.
+    """Settings of a serial line with 8 data bits.
 
     Args:
         baud: Bits a second.
@@ -25,7 +25,7 @@ class SerialSettings(NamedTuple):
     stop_bits: int
 
     def seconds(self, size: int) -> float:
-        """Return how long so many bytes take, s: each has a start bit, 8 bits, perhaps the parity's, and stop bits."""
+        """Return how long ``size`` bytes take, s: each with a start bit, 8 data bits, any parity bit, and stop bits."""
         return size * (9 + (self.parity != "N") + self.stop_bits) / self.baud
 
 
@@ -39,7 +39,7 @@ PROTOCOLS = {
 """Settings by name of the protocol."""
 
 BACKLOG = 2
-"""Commands that may wait in a port's buffer when the next one is written [choice]: one that is on the wire, and one."""
+"""Commands that may wait in a port's buffer when the next one is written [choice]: one being sent, and one more."""
 
 _REMEDIES = {
     errno.ENOENT: "there is no such device. Is it plugged in? Look into /dev/serial/by-id",
@@ -50,7 +50,7 @@ _REMEDIES = {
 
 
 class SerialPort:
-    """A `Transport` for commands, and an `Inlet` of what comes in, arrived when it is read, up to a tick late.
+    """A `Transport` and an `Inlet` over a serial port; arrival times are those of reading, up to a tick late.
 
     Args:
         device: Its path; those in /dev/serial/by-id/ stay the same when plugged in again.
@@ -58,7 +58,7 @@ class SerialPort:
 
     Raises:
         ImportError: pyserial is not installed.
-        OSError: The device is missing, of no use, or another's; the message says which.
+        OSError: The device is missing, unusable, or in use; the message says which.
         ValueError: The device has no such baud rate.
     """
 
@@ -67,13 +67,13 @@ class SerialPort:
     def __init__(self, device: str, settings: SerialSettings) -> None:
         self._device = device
         self._port = open_port(device, settings)
-        self._left = 0  # bytes that waited after the last write, if more than a backlog had to be thrown away before it
+        self._left = 0  # bytes that waited after the last write, if a backlog was discarded before it
 
     def write(self, data: bytes) -> bool:
-        """Write bytes; return whether the buffer took them all, and the wire takes what is in it.
+        """Write bytes; return whether the buffer took them all, and is being sent.
 
-        Where not, or where more than a `BACKLOG` waits, that is old: it is thrown away, so that the next command is
-        heard at once.
+        If not, or if more than a `BACKLOG` waits, the waiting bytes are old: they are discarded, so that the next
+        command is received at once.
 
         Raises:
             OSError: The device is gone.
@@ -85,7 +85,7 @@ class SerialPort:
             self._throw_away()
         self._left = len(data) if stuck else 0
         try:
-            # Not pyserial's own write, which tries a full buffer again until there is room.
+            # Not pyserial's own write, which retries until the buffer has room.
             written = os.write(descriptor, data)
         except BlockingIOError:
             written = 0
@@ -96,7 +96,7 @@ class SerialPort:
         return written == len(data) and not stuck
 
     def discard(self) -> None:
-        """Throw away what waits to be sent: what follows is heard at once.
+        """Discard bytes that wait to be sent, so that the next command is received at once.
 
         Raises:
             OSError: The device is gone.
@@ -117,11 +117,11 @@ class SerialPort:
             yield time.monotonic(), data
 
     def _waiting(self) -> int:
-        """Return how many bytes wait to be sent, as far as the driver knows; an adapter holds more."""
+        """Return how many bytes wait to be sent, as far as the driver knows; an adapter may hold more."""
         try:
             return int(self._port.out_waiting)
         except OSError as error:
-            if error.errno in (errno.ENOTTY, errno.EINVAL):  # a driver that does not say
+            if error.errno in (errno.ENOTTY, errno.EINVAL):  # the driver does not report it
                 return 0
             raise OSError(f"device={self._device}: it is gone: {error.strerror}.") from error
 
@@ -130,7 +130,7 @@ class SerialPort:
 
         try:
             self._port.reset_output_buffer()
-        except termios.error as error:  # which is no OSError
+        except termios.error as error:  # not an OSError
             raise OSError(f"device={self._device}: it is gone: {error}.") from error
 
     def close(self) -> None:

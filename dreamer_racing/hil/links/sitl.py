@@ -1,10 +1,10 @@
-"""Betaflight's firmware in a process of its own (SITL): channels to its UDP port 9004, and MSP by its TCP port 5761.
+"""The link to a Betaflight firmware in another process (SITL): channels to UDP port 9004, and MSP by TCP port 5761.
 
-A firmware that hears channels while it boots may stay in its receiver failsafe for good (betaflight#12401): none are
-sent before it has said that it has booted.
+A firmware that receives channels while it boots may stay in its receiver failsafe for good (betaflight#12401): none are
+sent before it reports that it has booted.
 
-The packet, 40 bytes, little endian: a time stamp f64 and 16 u16 µs. The stamp is constant: where the firmware reads the
-time from stamps, their jitter becomes its clock's.
+The packet, 40 bytes, little endian: a timestamp f64 and 16 u16 µs. The timestamp is constant: a firmware that reads the
+time from timestamps would take over their jitter.
 
 Reference: Betaflight, src/platform/SIMULATOR/sitl.c (rc_packet).
 """
@@ -33,27 +33,27 @@ def encode_sitl(channels: Sequence[float]) -> bytes:
 
 
 class SitlTransport:
-    """A `Transport` of channels to a firmware on this machine, which holds them back until it has booted.
+    """A `Transport` of channels to a firmware on this machine, which holds them back until that has booted.
 
     Args:
-        channels: To where it hears channels.
+        channels: Transport to its port for channels.
         serial: Its first serial port.
-        imu: Whether it is asked with each command what its IMU tells.
+        imu: Whether to request an IMU sample with each command.
     """
 
     ANSWERS_WITHIN = 10.0
-    """s after which one that was asked and does not answer is sent channels all the same [choice]: somebody else may
-    have its serial port, which takes one connection."""
+    """s after the first request after which channels are sent even without an answer [choice]: another program may have
+    the firmware's serial port, which takes one connection."""
 
     def __init__(self, channels: Transport, serial: SerialOverTcp, imu: bool = False) -> None:
         self._channels, self._serial = channels, serial
         self._always = IMU_REQUEST if imu else b""
         self._written = 0
-        self._asked_at: float | None = None  # when it was first, s
-        self._boots: MspTelemetry | None = MspTelemetry()  # what it says until it has booted
+        self._asked_at: float | None = None  # time of the first request, s
+        self._boots: MspTelemetry | None = MspTelemetry()  # reads its status until it has booted
 
     def write(self, data: bytes) -> bool:
-        """Send channels, and ask what is to be asked now; return whether the channels went out."""
+        """Send channels and the requests that are due; return whether the channels were sent."""
         request = (b"" if self._written % ASK_EVERY else REQUEST) + self._always
         self._written += 1
         if request and self._serial.write(request) and self._asked_at is None:
@@ -62,7 +62,7 @@ class SitlTransport:
         return self._boots is None and self._channels.write(data)
 
     def _look(self) -> None:
-        """See whether it has booted."""
+        """Check whether the firmware has booted."""
         if self._boots is None or self._asked_at is None:
             return
         status = self._boots.status
@@ -74,17 +74,17 @@ class SitlTransport:
             self._boots = None
 
     def discard(self) -> None:
-        """Throw away what was written and has not left yet."""
+        """Discard channels that were written but not sent yet."""
         self._channels.discard()
 
     def read(self) -> Iterator[tuple[float, bytes]]:
-        """Yield what its serial port has said, with the time now, s (``time.monotonic``)."""
+        """Yield the bytes from its serial port, with the time now, s (``time.monotonic``)."""
         if data := self._serial.read():
             if self._boots is not None:
                 self._boots.read(data)
             yield time.monotonic(), data
 
     def close(self) -> None:
-        """Close both."""
+        """Close both transports."""
         self._channels.close()
         self._serial.close()

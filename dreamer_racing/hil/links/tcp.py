@@ -1,4 +1,4 @@
-"""Bytes to the serial port of a firmware on this machine: what a wire is to a flight controller."""
+"""A transport over TCP to the serial port of a firmware on this machine."""
 
 from __future__ import annotations
 
@@ -12,21 +12,21 @@ class TcpTransport:
     """A `Transport` over `SerialOverTcp`.
 
     Args:
-        serial: The port; closed with it.
+        serial: The port; closed with the transport.
     """
 
     def __init__(self, serial: SerialOverTcp) -> None:
         self._serial = serial
 
     def write(self, data: bytes) -> bool:
-        """Write bytes; return whether they went out."""
+        """Write bytes; return whether they were sent."""
         return self._serial.write(data)
 
     def discard(self) -> None:
         """Do nothing: bytes leave at once."""
 
     def read(self) -> Iterator[tuple[float, bytes]]:
-        """Yield what has come back, with the time now, s (``time.monotonic``)."""
+        """Yield the received bytes, with the time now, s (``time.monotonic``)."""
         if data := self._serial.read():
             yield time.monotonic(), data
 

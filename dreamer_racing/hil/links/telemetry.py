@@ -1,4 +1,4 @@
-"""What comes back from a vehicle, as far as it is read: voltages, what its IMU tells, why it does not arm."""
+"""Parsing of a vehicle's telemetry: battery voltages, IMU samples, and why it does not arm."""
 
 from __future__ import annotations
 
@@ -9,11 +9,11 @@ import numpy as np
 
 
 class Telemetry(ABC):
-    """Finds battery voltages and samples of an IMU in bytes that arrive in pieces. Other frames are passed over.
+    """Extracts battery voltages and IMU samples from bytes that arrive in chunks. Other frames are ignored.
 
     Attributes:
-        felt: Samples (6,) of the IMU that have been found, oldest first, see `hil.imu`; whoever takes them clears it.
-        rejected: Frames so far that were damaged or say no voltage, and stretches of bytes that were no frame.
+        felt: IMU samples (6,) found so far, oldest first, see `hil.imu`; whoever reads them clears the list.
+        rejected: Number of frames that were damaged or without a usable value, and of byte runs that were no frame.
     """
 
     def __init__(self) -> None:
@@ -22,37 +22,37 @@ class Telemetry(ABC):
 
     @abstractmethod
     def read(self, data: bytes) -> list[float]:
-        """Take in bytes; return the voltages in them, V, oldest first. It never raises."""
+        """Parse bytes; return the voltages in them, V, oldest first. It never raises."""
 
     def refusal(self, armed: bool) -> str:
-        """Return why the flight controller does not fly what it is told, or would not; empty as far as is known.
+        """Return why the flight controller does not, or would not, follow commands; empty if no reason is known.
 
         Args:
-            armed: Whether it was told to be armed.
+            armed: Whether the last command was armed.
         """
         return ""
 
 
 class FrameReader:
-    """Cuts a stream of bytes into frames. What is damaged is skipped up to the next frame that is whole.
+    """Splits a stream of bytes into frames. Damaged bytes are skipped up to the next intact frame.
 
     Args:
-        size_of: Returns the size of the frame that begins the bytes that it is given, up to 8; 0 if that takes more
-            bytes to tell; None: none begins.
+        size_of: Returns the size of the frame at the start of the given bytes, up to 8; 0 if more bytes are needed to
+            tell; None if no frame starts there.
         is_whole: Returns whether the checksum of a frame is right.
 
     Attributes:
-        rejected: Frames so far that were damaged, and stretches of bytes that were no frame.
+        rejected: Number of frames that were damaged, and of byte runs that were no frame.
     """
 
     def __init__(self, size_of: Callable[[bytes], int | None], is_whole: Callable[[bytes], bool]) -> None:
         self.size_of, self.is_whole = size_of, is_whole
         self.rejected = 0
         self._buffer = bytearray()
-        self._lost = False  # whether the last byte was skipped: those in a row count once
+        self._lost = False  # whether the last byte was skipped: consecutive ones count once
 
     def read(self, data: bytes) -> Iterator[bytes]:
-        """Take in bytes; yield the whole frames in them, oldest first."""
+        """Add bytes; yield the intact frames in them, oldest first."""
         self._buffer += data
         while self._buffer:
             size = self.size_of(bytes(self._buffer[:8]))

@@ -1,4 +1,4 @@
-"""Commands over UDP: the packet in SI units that a simulated vehicle takes, and the socket that never waits.
+"""Commands over UDP: the packet in SI units for a simulated vehicle, and a non-blocking socket.
 
 The packet, little endian, 53 bytes: ``b"DRC1"``, sequence number u32, the sender's ``time.monotonic`` f64 (s), armed u8
 (0 or 1), collective thrust f64 (m/s²), body rates 3 f64 (rad/s), and CRC-32 u32 of all before it. Frames and units are
@@ -32,12 +32,12 @@ _PASSING = {errno.EAGAIN, errno.ECONNREFUSED, errno.ENOBUFS, errno.ENETDOWN, err
 
 
 class CommandPacket(NamedTuple):
-    """What a command packet says.
+    """The content of a command packet.
 
     Args:
-        sequence: Counts packets, modulo 2³²; what is not newer than the last one is a copy of an old one.
+        sequence: Counts packets, modulo 2³²; one that is not newer than the last is a repeated or late one.
         stamp: s, the sender's own clock.
-        command: What to do.
+        command: The command.
     """
 
     sequence: int
@@ -54,7 +54,7 @@ def encode_command(packet: CommandPacket) -> bytes:
 
 
 def decode_command(data: bytes) -> CommandPacket | None:
-    """Return what a packet says; None if it is none: of another size or kind, damaged, or with impossible numbers."""
+    """Return a packet's content; None if it has another size or kind, is damaged, or has impossible numbers."""
     if (
         len(data) != PACKET_SIZE
         or data[:4] != MAGIC
@@ -68,21 +68,21 @@ def decode_command(data: bytes) -> CommandPacket | None:
 
 
 class UdpTransport:
-    """Sends datagrams to one address, and takes in what that address sends back to the port they come from.
+    """Sends datagrams to one address, and receives its replies.
 
     Args:
         host: Name or address.
-        port: To send to.
+        port: Port to send to.
 
     Raises:
         OSError: There is no such host; the message names it.
     """
 
-    _MOST = 64  # datagrams taken in at a time: a flood must not stop the loop
+    _MOST = 64  # datagrams read per call, so that a flood cannot stall the loop
     _SIZE = 2048  # bytes; more than an Ethernet frame holds
 
     def __init__(self, host: str, port: int) -> None:
-        self._heard = True  # whether the last datagram found somebody, as far as is known
+        self._heard = True  # whether the last datagram reached a listener, as far as is known
         self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         self._socket.setblocking(False)
         try:
@@ -92,7 +92,7 @@ class UdpTransport:
             raise OSError(f"host={host}, port={port}: cannot be sent to: {error}") from error
 
     def write(self, data: bytes) -> bool:
-        """Send a datagram; return whether it went out: not so if buffers are full or the last one found nobody."""
+        """Send a datagram; return whether that worked: not if buffers are full or the last one reached no listener."""
         heard, self._heard = self._heard, True
         try:
             return self._send(data) and heard
@@ -102,10 +102,10 @@ class UdpTransport:
             return False
 
     def _send(self, data: bytes) -> bool:
-        """Send a datagram, whatever the last one met; return whether that found somebody, as far as is known."""
+        """Send a datagram even if the last one was refused; return whether the last one reached a listener."""
         try:
             self._socket.send(data)
-        except ConnectionRefusedError:  # of the last one, and this one did not go out
+        except ConnectionRefusedError:  # is of the last datagram; this one was not sent
             self._socket.send(data)
             return False
         return True
@@ -114,9 +114,9 @@ class UdpTransport:
         """Do nothing: datagrams leave at once, or not at all."""
 
     def read(self) -> Iterator[tuple[float, bytes]]:
-        """Yield the datagrams that have come back, with the time now, s (``time.monotonic``).
+        """Yield the received datagrams, with the time now, s (``time.monotonic``).
 
-        What an earlier datagram met on its way, the next `write` says.
+        An error of an earlier datagram is reported by the next `write`.
         """
         for _ in range(self._MOST):
             try:
@@ -136,10 +136,10 @@ class UdpTransport:
 
 
 class PacketTelemetry(Telemetry):
-    """Reads the packets of `hil.imu`, one a datagram."""
+    """Reads the packets of `hil.imu`, one per datagram."""
 
     def read(self, data: bytes) -> list[float]:
-        """Take in a datagram; there are no voltages in it."""
+        """Parse a datagram, which has no voltages."""
         sample = decode_imu(data)
         self.rejected += sample is None
         self.felt += [] if sample is None else [sample]
@@ -147,12 +147,12 @@ class PacketTelemetry(Telemetry):
 
 
 class UdpLink(TransportLink):
-    """Sends command packets to a vehicle that takes setpoints as they are.
+    """Sends command packets to a vehicle that takes setpoints in SI units.
 
     Args:
         host: Name or address.
         port: Where it listens.
-        imu: Whether to hear what its IMU tells.
+        imu: Whether to receive IMU samples.
 
     Raises:
         OSError: There is no such host.

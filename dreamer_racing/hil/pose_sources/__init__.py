@@ -1,13 +1,13 @@
 """Sources of poses, by name.
 
-| name | comes over | message | needs |
+| name | transport | message | needs |
 |---|---|---|---|
 | ``udp`` | UDP | the packet of `hil.pose` | port |
 | ``mavlink`` | UDP, or serial port | ODOMETRY unless another is named | port or device |
 | ``ros2`` | ROS 2 | PoseStamped unless Odometry is named | topic, and an installed ROS 2 |
 
-All give poses in the frames of `Pose`, stamped by the sender's clock. Velocities that a message lacks are made from
-successive poses.
+All give poses in the frames of `Pose`, stamped by the sender's clock. Velocities that a message lacks are estimated
+from successive poses.
 """
 
 from __future__ import annotations
@@ -27,17 +27,17 @@ from dreamer_racing.settings import Range, check_settings, given, setting
 
 @dataclass(frozen=True)
 class PoseConfig:
-    """Which source of poses, and what it needs.
+    """The choice of a pose source, and its settings.
 
     Attributes:
         name: One of `POSE_SOURCES`.
-        host: Address to listen on over UDP; other machines reach it only if this says so.
+        host: Address to listen on over UDP; the default accepts poses from this machine only.
         port: UDP port to listen on; 0 for a free one.
-        device: Path of a serial port; where it is given, ``mavlink`` listens to it and not to the UDP port.
-        baud: Bits a second of the serial port; the protocol's own unless given.
-        topic: Of ROS 2.
-        message: Which message is the pose; the source's first one unless given.
-        smoothing: s, time constant of velocities that are made from poses; 0: they are not smoothed.
+        device: Path of a serial port; if given, ``mavlink`` listens to it and not to the UDP port.
+        baud: Bits a second of the serial port; by default the protocol's.
+        topic: Topic of ROS 2.
+        message: Message type of the pose; by default the source's first one.
+        smoothing: s, time constant of velocities estimated from poses; 0: they are not smoothed.
 
     Raises:
         ValueError: A number is out of its range.
@@ -57,10 +57,10 @@ class PoseConfig:
 
 
 def make_poses(config: PoseConfig) -> PoseSource:
-    """Make a source of poses and open what it listens to.
+    """Make a pose source and open its port, device or topic.
 
     Raises:
-        ValueError: There is no source of that name, or something that it needs is not given, or cannot be.
+        ValueError: There is no source of that name, or a setting that it needs is missing or impossible.
         OSError: Device or port cannot be used.
         ImportError: A package is missing; the message says how to get it.
 
@@ -90,14 +90,14 @@ def _ros2(config: PoseConfig) -> PoseSource:
 
 
 WITHOUT_VELOCITIES = ("VISION_POSITION_ESTIMATE", "ATT_POS_MOCAP", "PoseStamped")
-"""Messages of poses without velocities, which `PoseConfig.smoothing` is for."""
+"""Messages without velocities, to which `PoseConfig.smoothing` applies."""
 
 POSE_SOURCES: dict[str, Callable[[PoseConfig], PoseSource]] = {"udp": _udp, "mavlink": _mavlink, "ros2": _ros2}
-"""What makes a source of poses, by its name."""
+"""Factory of each pose source, by name."""
 
 
 def _message(config: PoseConfig, messages: Iterable[str]) -> str:
-    """Return the name of the message that is wanted; refuse one that the source does not know."""
+    """Return the configured message type; refuse one that the source does not know."""
     known = list(messages)
     message = known[0] if config.message is None else config.message
     if message not in known:

@@ -1,11 +1,11 @@
-"""Poses of an autopilot (PX4, ArduPilot) or of a motion capture that speaks MAVLink.
+"""Poses from an autopilot (PX4, ArduPilot) or a motion-capture system that speaks MAVLink.
 
 | message | attitude | velocity | body rates |
 |---|---|---|---|
-| ``ODOMETRY`` | in it | in it: body FRD, or the frame of the position | in it |
-| ``LOCAL_POSITION_NED`` | the newest ``ATTITUDE_QUATERNION`` | in it | of the attitude |
-| ``VISION_POSITION_ESTIMATE`` | in it, as angles | made from poses | made from poses |
-| ``ATT_POS_MOCAP`` | in it | made from poses | made from poses |
+| ``ODOMETRY`` | included | included: body FRD, or the frame of the position | included |
+| ``LOCAL_POSITION_NED`` | the newest ``ATTITUDE_QUATERNION`` | included | of the attitude's message |
+| ``VISION_POSITION_ESTIMATE`` | included, as angles | estimated from poses | estimated from poses |
+| ``ATT_POS_MOCAP`` | included | estimated from poses | estimated from poses |
 
 MAVLink's world is NED (x north, y east, z down), or FRD (x where forward was at the start, y to its right, z down); its
 body is FRD (x forward, y right, z down). Our world has the same x and its z up: a track's x axis points north, its y
@@ -14,8 +14,8 @@ axis west. MAVLink's world and ours, its body and ours, differ by half a turn ab
 - a vector (x, y, z) becomes (x, −y, −z), be it a position, a velocity, or body rates;
 - an attitude (w, x, y, z), FRD → NED, becomes (w, x, −y, −z), FLU → z up: the axis of a rotation is a vector.
 
-Which message counts is a setting, for an autopilot may send several, each with its own delay and origin. The port is
-one vehicle's: who sent a message is not looked at. Stamps are those of the messages, mostly since the autopilot began.
+The message type is a setting, because an autopilot may send several, each with its own delay and origin. The port is
+for one vehicle: senders are not checked. Timestamps are those of the messages, mostly since the autopilot's start.
 
 Reference: mavlink.io/en/messages/common.html.
 """
@@ -34,20 +34,20 @@ from dreamer_racing.hil.pose import PosePacket, make_packet, plausible
 from dreamer_racing.hil.pose_sources.messages import SMOOTHING, Measurement, MessagePose
 
 LOCAL_NED, BODY_FRD, LOCAL_FRD = 1, 12, 20
-"""Of MAV_FRAME."""
+"""Values of MAV_FRAME."""
 
 PAIR_WITHIN = 0.05
-"""s by which a position and an attitude may differ to be a pose [choice]: autopilots send both at 20 Hz or more."""
+"""s between a position and an attitude up to which they form a pose [choice]: autopilots send both at 20 Hz or more."""
 
 _LEVEL = np.array((1.0, 0.0, 0.0, 0.0))
 
 
 class MavlinkPose(MessagePose):
-    """Takes poses from MAVLink messages, of version 1 or 2.
+    """Reads poses from MAVLink messages, of version 1 or 2.
 
     Args:
-        inlet: Gives the bytes; closed with the source.
-        message: Which message is the pose, one of `MESSAGES`; others are passed over and not counted.
+        inlet: Receives the bytes; closed with the source.
+        message: Message type of the pose, one of `MESSAGES`; others are ignored and not counted.
         smoothing: See `MessagePose`.
 
     Raises:
@@ -63,7 +63,7 @@ class MavlinkPose(MessagePose):
         self._attitude: PosePacket | None = None  # the newest ATTITUDE_QUATERNION
 
     def listen(self) -> Iterator[tuple[float, Measurement | None]]:
-        """Yield the messages that are wanted, and None for what is none at all."""
+        """Yield the wanted messages, and None for damaged data."""
         for arrival, data in self._inlet.read():
             for message in self._parse(data):
                 kind = "BAD_DATA" if message is None else message.get_type()
@@ -79,10 +79,10 @@ class MavlinkPose(MessagePose):
         self._inlet.close()
 
     def _parse(self, data: bytes) -> list[Any]:
-        """Return the messages in a piece of bytes; None where a datagram ends amid one, or holds none."""
+        """Return the messages in a chunk of bytes, and None for a datagram that ends within one, or holds none."""
         if not self._inlet.whole:
             return self._parser.parse_buffer(data) or []
-        parser = self._make_parser()  # what one datagram left unfinished must not swallow the next
+        parser = self._make_parser()  # an incomplete datagram must not swallow the next one
         messages = parser.parse_buffer(data) or []
         return [*messages, None] if parser.buf_len() or not messages else messages
 
@@ -107,7 +107,7 @@ def _read_odometry(message: Any, attitude: PosePacket | None) -> Measurement | N
 
 
 def _read_position(message: Any, attitude: PosePacket | None) -> Measurement | None:
-    """Return the position with the attitude, turned on to the time of the position."""
+    """Return the position with the newest attitude, which is extrapolated to the time of the position."""
     stamp = 1e-3 * message.time_boot_ms
     if attitude is None or abs(stamp - attitude.stamp) > PAIR_WITHIN:
         return None
@@ -141,11 +141,11 @@ MESSAGES: dict[str, Callable[[Any, PosePacket | None], Measurement | None]] = {
     "VISION_POSITION_ESTIMATE": _read_vision,
     "ATT_POS_MOCAP": _read_mocap,
 }
-"""What reads a message, with the newest attitude that came on its own, by the message's name."""
+"""Reader of each message type, which gets the message and the newest separate attitude."""
 
 
 def _read_attitude(message: Any) -> PosePacket | None:
-    """Return attitude and body rates of an ATTITUDE_QUATERNION; None if they are none."""
+    """Return attitude and body rates of an ATTITUDE_QUATERNION; None if they are implausible."""
     attitude = _half_turn_of_attitude((message.q1, message.q2, message.q3, message.q4))
     rates = _half_turn(message.rollspeed, message.pitchspeed, message.yawspeed)
     if not plausible(attitude, rates):
@@ -154,11 +154,11 @@ def _read_attitude(message: Any) -> PosePacket | None:
 
 
 def _half_turn(x: float, y: float, z: float) -> np.ndarray:
-    """Return a vector of NED or FRD in our world or body."""
+    """Convert a vector from NED or FRD to our world or body frame."""
     return np.array((x, -y, -z))
 
 
 def _half_turn_of_attitude(attitude: Sequence[float]) -> np.ndarray:
-    """Return an attitude (4,) wxyz, FRD → NED, as FLU → z up."""
+    """Convert an attitude (4,) wxyz from FRD → NED to FLU → z up."""
     w, x, y, z = attitude
     return np.array((w, x, -y, -z))

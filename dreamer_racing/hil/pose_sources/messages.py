@@ -1,4 +1,4 @@
-"""What all sources of messages are made of: a way to read a message, and what makes a pose packet of what it says."""
+"""The base class of message-based pose sources, which makes pose packets from the content of messages."""
 
 from __future__ import annotations
 
@@ -15,17 +15,17 @@ from dreamer_racing.hil.stamping import SILENCE
 from dreamer_racing.hil.velocity import VelocityEstimator
 
 SMOOTHING = 0.01
-"""s, time constant of velocities that are made from poses [choice]: two poses of a motion capture at 200 Hz."""
+"""s, time constant of velocities estimated from poses [choice]: two poses of a motion capture at 200 Hz."""
 
 
 class Measurement(NamedTuple):
-    """What a message says, in the frames of `Pose`; not yet judged.
+    """The content of a message, in the frames of `Pose`; not yet checked.
 
     Args:
         stamp: s, the sender's own clock.
         position: (3,) m, world.
         attitude: (4,) wxyz.
-        linear_velocity: (3,) m/s, world, or body where ``in_body``; None: it is made from poses, as are body rates.
+        linear_velocity: (3,) m/s, world, or body if ``in_body``; None: estimated from poses, as are body rates.
         body_rates: (3,) rad/s, body frame.
         in_body: Whether ``linear_velocity`` is along the body's axes.
     """
@@ -39,17 +39,17 @@ class Measurement(NamedTuple):
 
 
 class MessagePose(ABC):
-    """A `PoseSource` of messages without sequence numbers; a subclass says what they measured.
+    """A `PoseSource` of messages without sequence numbers; subclasses read the messages.
 
-    Packets are numbered by counting. A stamp that is not newer than the newest one is a copy or came late, and does not
-    count; only after a silence may stamps begin anew, as in `PoseClock`.
+    Packets are numbered by counting. A message whose timestamp is not newer than the newest one is rejected, as
+    repeated or late; only after a silence may timestamps restart, as in `PoseClock`.
 
     Args:
-        smoothing: s, time constant of velocities that are made from poses, see `VelocityEstimator`.
+        smoothing: s, time constant of velocities estimated from poses, see `VelocityEstimator`.
 
     Attributes:
-        rejected: Messages so far that made no pose: those of `PoseSource`, those with an old stamp, and the first one
-            of poses without velocities, and after a gap or a jump.
+        rejected: Number of messages that gave no pose: as in `PoseSource`, those with an old timestamp, and, without
+            velocities, the first one and those after a gap or a jump.
     """
 
     def __init__(self, smoothing: float) -> None:
@@ -63,15 +63,15 @@ class MessagePose(ABC):
         """Yield the messages that have arrived, without waiting.
 
         Yields:
-            When it arrived (s, ``time.monotonic``), and what it says; None if it is damaged or of no use.
+            Arrival time (s, ``time.monotonic``) and content; None if that is damaged or unusable.
         """
 
     @abstractmethod
     def close(self) -> None:
-        """Give back socket or device; may be called twice."""
+        """Close the socket or device; may be called twice."""
 
     def poll(self) -> list[Received]:
-        """Return what has arrived since the last call, oldest first, without waiting."""
+        """Return the packets that arrived since the last call, oldest first, without blocking."""
         received = []
         for arrival, measured in self.listen():
             packet = None if measured is None else self._packet(arrival, measured)
@@ -82,7 +82,7 @@ class MessagePose(ABC):
         return received
 
     def _packet(self, arrival: float, measured: Measurement) -> PosePacket | None:
-        """Return what is known now; None if that is no pose."""
+        """Return the pose packet of a measurement; None if it gives no pose."""
         stamp, position, attitude, velocity, rates, in_body = measured
         velocity, rates = (np.zeros(3) if vector is None else vector for vector in (velocity, rates))
         packet = make_packet(self._sequence, stamp, position, attitude, velocity, rates)

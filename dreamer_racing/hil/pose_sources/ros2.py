@@ -2,13 +2,13 @@
 
 | message | velocity | body rates |
 |---|---|---|
-| ``PoseStamped`` (geometry_msgs), as of ``/vrpn_mocap/<name>/pose`` | made from poses | made from poses |
-| ``Odometry`` (nav_msgs) | in it, body frame | in it |
+| ``PoseStamped`` (geometry_msgs), as ``/vrpn_mocap/<name>/pose`` | estimated from poses | estimated from poses |
+| ``Odometry`` (nav_msgs) | included, body frame | included |
 
-ROS's world is z up, its body FLU, as ours are (REP 103), but quaternions are xyzw. Twists are those of the child frame,
-which is taken to be the body, and the message's own frame the world. Stamps are those of the headers.
+ROS's world is z up, its body FLU, as ours are (REP 103), but quaternions are xyzw. Twists are in the child frame, which
+is taken to be the body; the message's own frame is taken to be the world. Timestamps are those of the headers.
 
-A message counts as arrived when the loop takes it in, up to a tick late: ``stamping=sender`` knows better.
+A message's arrival time is when the loop reads it, up to a tick late: ``stamping=sender`` is more exact.
 """
 
 from __future__ import annotations
@@ -26,32 +26,32 @@ NODE = "dreamer_racing_poses"
 
 
 class Ros2Pose(MessagePose):
-    """Subscribes to a topic, with a node of its own.
+    """Subscribes to a topic with its own node.
 
     Args:
         topic: Its name.
-        message: Of which type it is, one of `MESSAGES`.
+        message: Message type, one of `MESSAGES`.
         smoothing: See `MessagePose`.
 
     Raises:
         ImportError: rclpy or the messages' package is missing; the message says how to get it.
     """
 
-    _MOST = 256  # messages taken in at a time: a flood must not stop the loop
+    _MOST = 256  # messages read per call, so that a flood cannot stall the loop
 
     def __init__(self, topic: str, message: str = "PoseStamped", smoothing: float = SMOOTHING) -> None:
         super().__init__(smoothing)
         package, self._read = MESSAGES[message]
         self._rclpy, signals, qos, messages = map(_import, ("rclpy", "rclpy.signals", "rclpy.qos", package))
         self._heard: list[tuple[float, Any]] = []
-        # Signals are the flight loop's: Ctrl-C must disarm, not merely end ROS.
+        # The flight loop handles signals: Ctrl-C must disarm, not merely end ROS.
         self._rclpy.init(args=[], signal_handler_options=signals.SignalHandlerOptions.NO)
         self._node = self._rclpy.create_node(NODE, start_parameter_services=False)
-        # Best effort: motion captures publish so, and to hear again what was lost would be too late.
+        # Best effort: motion-capture systems publish so, and a lost pose sent again would be too late.
         self._node.create_subscription(getattr(messages, message), topic, self._hear, qos.qos_profile_sensor_data)
 
     def listen(self) -> Iterator[tuple[float, Measurement | None]]:
-        """Yield the messages that are there."""
+        """Yield the messages that have arrived."""
         for _ in range(self._MOST):
             before = len(self._heard)
             self._rclpy.spin_once(self._node, timeout_sec=0)
@@ -62,7 +62,7 @@ class Ros2Pose(MessagePose):
             yield arrival, self._read(message)
 
     def close(self) -> None:
-        """Give back the node."""
+        """Destroy the node."""
         if self._node is not None:
             self._node.destroy_node()
             self._rclpy.shutdown()
