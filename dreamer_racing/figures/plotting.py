@@ -222,6 +222,7 @@ def stages_of_training(run: RunData) -> tuple[dict[Path, Dream], list[str]]:
         The dreams, each once, by file, and what was left out.
     """
     files = evaluation_files(run.directory, "_dream.npz")
+    files = [file for file in files if file.name.partition("_")[0].isdigit()] or files  # of training, if there are any
     problems: list[str] = []
     choices = (files, files[len(files) // 2 :: -1], files[::-1])  # before the first there is none: the one after it
     found = [first_readable(choice, Dream.load, problems) for choice in choices]

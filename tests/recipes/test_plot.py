@@ -133,6 +133,10 @@ def test_instead_of_half_a_dream_the_one_before_it_is_shown(runs, recipe):
         return [file.name[5:9] for file in stages], problems
 
     assert shown() == (["1000", "3000", "5000"], [])
+    later = folder.parent / "evaluation" / "evaluations"  # by `recipes/evaluate.py`, which is no stage of training
+    later.mkdir(parents=True)
+    flat_dream().save(later / "deterministic_dream.npz")
+    assert shown() == (["1000", "3000", "5000"], [])
     cut(folder / "000003000_dream.npz")
     cut(folder / "000005000_dream.npz")
     names, problems = shown()
