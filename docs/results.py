@@ -31,7 +31,7 @@ from typing import Any
 ROOT = Path(__file__).resolve().parents[1]
 PAGE = ROOT / "docs" / "results.md"
 PICTURES = (".png", ".gif", ".svg")
-WIDTH = 128
+WIDTH = 132
 BRIEF = "Further measurements"
 COLUMNS = ("value", "seeds", "minutes", "command")
 """Of the second table, behind the result."""
@@ -66,11 +66,10 @@ lap time           best 3.96 s, mean 4.06 s (297 laps)
 |---|---|
 | success | share of flights that finish three laps, each from another randomised start, by the deterministic policy |
 | sampled | success of the stochastic policy, whose actions are samples from its distribution |
-| minutes | of one core, for the whole training; cores differ by a factor of two (behind *Commands, commits, machine*) |
-| state decoded | in training the world model learns the true state; in flight the agent sees only images |
-| images alone | without the true state, also in training |
+| minutes | of one core, for the whole training. Rows are of different CPUs (factor two): compare env_steps |
+| state decoded; images alone | in training the world model learns the true state; it does not. In flight agents see only images |
 | stopped | ended by hand, before the planned number of env_steps |
-| `schedule.NAME` | changes setting NAME in training, here as the gate pass rate rises ([`by: known`](recipes.md#options)) |
+| `schedule.NAME` | moves setting NAME during training as more gates are passed ([clock `known`](recipes.md#options)) |
 """
 FOOT = """## Where the numbers come from
 

@@ -127,7 +127,7 @@ def test_long_lines_are_broken_and_tables_are_not(results, folder):
     row = "|" + " a |" * 100
     change(folder, text=f"{'word ' * 100}\n\n{row}", today=f"python x.py {'option=value ' * 30}")
     lines = results.make_page(folder).splitlines()
-    assert row in lines and max(len(line) for line in lines if line != row and "](" not in line) <= 128
+    assert row in lines and max(len(line) for line in lines if line != row and "](" not in line) <= results.WIDTH
     assert any(line.startswith("    option=value") for line in lines)
 
 
