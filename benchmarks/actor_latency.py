@@ -1,14 +1,13 @@
-"""Milliseconds per step of exported actors in onnxruntime, one thread: those that ship, and sizes with initial weights.
+"""Benchmark of the latency of exported actors in onnxruntime: included agents, and sizes with initial weights.
 
     python benchmarks/actor_latency.py --actors circle kidney figure8 --sizes paper_large --json actor_latency.json
     python benchmarks/actor_latency.py --sizes paper_large --keep exports
     python recipes/hil.py actor=exports/paper_large arm=false patience=60     # beside recipes/plant.py track=circle
 
-Sizes are exported as recipes/export.py does it, parity check included, of networks with initial weights: how long a
-step takes does not depend on what was learned, nor on what is seen, which is noise here. They are written in parts,
-too: `act` is what is left between image and action where the memory was advanced before the image came. With --keep an
-export stays in a folder of its size's name, and flies like any other, if badly: with arm=false the loop sees, chooses
-and sends at each tick, and never arms.
+Sizes are exported like in recipes/export.py, with the parity check, from networks with initial weights. Images are
+noise. Neither weights nor images affect the latency. Sizes are also exported in two parts: `act` is the latency from
+image to action if the recurrent state was advanced before the image arrived. With --keep, exports stay in folders named
+after their sizes and can be used like any other: with arm=false, the loop runs without arming.
 """
 
 import logging
@@ -37,7 +36,7 @@ COLUMNS = (
 
 
 def main() -> None:
-    """Measure every actor asked for, one after the other."""
+    """Measure every requested actor, one after another."""
     parser = make_parser(__doc__)
     parser.add_argument("--actors", nargs="*", default=[], help="agents that ship by their names, or .onnx files")
     parser.add_argument("--sizes", nargs="*", default=[], choices=SIZES, metavar="SIZE", help=f"of {', '.join(SIZES)}")
@@ -50,7 +49,7 @@ def main() -> None:
     if not arguments.actors and not arguments.sizes:
         parser.error("nothing to measure: give --actors or --sizes")
     torch.set_num_threads(1)
-    # Its exporter says four times that torchvision is not installed, which nothing here needs.
+    # The exporter warns four times that torchvision is not installed, which is not needed here.
     logging.getLogger("torch.onnx").setLevel(logging.ERROR)
     paths = {name: AGENTS / name / ACTOR if (AGENTS / name).is_dir() else Path(name) for name in arguments.actors}
     with tempfile.TemporaryDirectory() as folder:
@@ -80,7 +79,7 @@ def export_initial(size: str, track: str, rate: float, folder: Path) -> Path:
 
 
 def measure(name: str, path: Path, steps: int, threads: int) -> dict[str, Any]:
-    """Time single steps of an actor."""
+    """Time single steps of an actor; return its record."""
     actor = OnnxActor(path, threads=threads, whole=True)
     entry = actor.contract["inputs"][0]
     seen = np.random.default_rng(0).integers(0, 256, (steps, *entry["shape"][1:])).astype(entry["type"])
@@ -98,7 +97,7 @@ def measure(name: str, path: Path, steps: int, threads: int) -> dict[str, Any]:
 
 
 def weights_of(path: Path) -> list[Path]:
-    """The .onnx file, and the one of its weights where they lie apart."""
+    """Return the .onnx file and, if there is one, its separate file of weights."""
     return [path, *path.parent.glob("*.safetensors")]
 
 

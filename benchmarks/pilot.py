@@ -1,13 +1,13 @@
-"""Lap times of the scripted pilot, the reference for what the tracks allow.
+"""Benchmark of the scripted pilot's lap times, a reference for what is possible on each track.
 
     python benchmarks/pilot.py --json results/pilot.json
     python benchmarks/pilot.py --speed 0.95 --num-envs 64
 
-Every run is three laps from the start pose, at rest; preset `faithful` with its randomisation, another draw in each
-run. Columns: `clean` runs without a crash and with all laps of N; `line` is the planned lap time; `lap_first`,
-`lap_mean` and `lap_best` in s, where mean and best are of the flying laps (the second and third); speeds in m/s;
-`offset` is the greatest distance from a gate's centre in m; `view` is the share of time in which the nose camera sees
-the centre of the target gate.
+Every run is three laps from the start pose, at rest; with preset `faithful`, each run draws its own randomisation.
+Columns: `clean` is the number of runs of N with all laps and no crash; `line` the planned lap time; `lap_first`,
+`lap_mean` and `lap_best` in s, with mean and best over the flying laps (the second and third); speeds in m/s; `offset`
+the largest distance from a gate's centre in m; `view` the share of time in which the nose camera sees the centre of
+the target gate.
 """
 
 from collections import Counter
@@ -52,7 +52,7 @@ def main() -> None:
 
 
 def summary(flight: FlownLaps) -> dict[str, Any]:
-    """The numbers of some runs."""
+    """Return the statistics of some runs."""
     flying_laps = flight.lap_times[:, 1:]
     flying_laps = flying_laps[flying_laps.isfinite()]
     crashes = Counter(CrashCause(int(cause)).name.lower() for cause in flight.crash if cause)

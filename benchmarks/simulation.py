@@ -1,22 +1,22 @@
-"""Environment steps per second: the worlds alone, and through TorchRL.
+"""Benchmark of environment steps per second, of the worlds alone and through TorchRL.
 
     python benchmarks/simulation.py --json results/simulation.json         # this machine's CPU
     python benchmarks/simulation.py --device cuda --json results/simulation_cuda.json
     python benchmarks/simulation.py --page results/simulation*.json     # no measuring: writes docs/benchmarks.md
 
-Every row is a process of its own. `images` is `none` (state only, `vector`), a renderer of the CPU backend, `warp_cuda`
-(physics on CPU, images on CUDA) or `cuda` (all on CUDA). `steps/s` are control steps summed over N worlds:
+Every row is measured in a separate process. `images` is `none` (state only, `vector`), a renderer of the CPU backend,
+`warp_cuda` (physics on CPU, images on CUDA) or `cuda` (all on CUDA). `steps/s` are control steps summed over N worlds:
 
-* `worlds`: `RaceWorlds` stepped, observed and reset where an episode ended, with random actions, in plain tensors;
+* `worlds`: `RaceWorlds` in plain tensors with random actions: step, observe, reset where an episode ended;
 * `collector`: a TorchRL `Collector` with a random policy;
 * `agent`: as `worlds`, with the networks and the recurrent state of a DreamerV3 policy of `--actor` size;
 * `actor`: a `Collector` with that policy.
 
-They are measured in turns, five times, and the best reported, because other load on the machine only ever slows.
-`lost` is the share of the worlds' speed that the collector loses, `actor_lost` the same of `agent` and `actor`. On CPU
+They are measured alternately, five times. The best is reported, because other load only slows a measurement down.
+`lost` is the share of the worlds' speed that the collector loses; `actor_lost` the same for `agent` and `actor`. On CPU
 the milliseconds of a collected step are split into physics, race rules, rendering and TorchRL (specs, TensorDicts,
 resets, storing).
-`memory` is the process's peak resident memory, or what is in use on the GPU, GiB.
+`memory` is the process's peak resident memory, or the GPU memory in use, GiB.
 """
 
 import argparse
@@ -51,7 +51,7 @@ PARTS = ("physics", "race", "render")
 MODES = ("worlds", "collector", "agent", "actor")
 MILLISECONDS = tuple(f"{part}_ms" for part in (*PARTS, "torchrl"))
 COLUMNS = ("images", "num_envs", *MODES, "lost", "actor_lost", *MILLISECONDS, "memory_gib")
-ROLLOUT = 16  # control steps in a batch
+ROLLOUT = 16  # control steps per batch
 TURNS = 5
 PAGE = Path(__file__).parents[1] / "docs" / "benchmarks.md"
 BEGIN, END = "<!-- benchmarks/simulation.py writes this -->", "<!-- end -->"
@@ -62,7 +62,7 @@ NAMES = {
 
 
 def main() -> None:
-    """Measure every combination asked for, or write the table of the page."""
+    """Measure every requested combination, or write the page's table."""
     parser = make_parser(__doc__)
     parser.add_argument("--device", default="cpu", choices=("cpu", "cuda"))
     parser.add_argument("--track", default="kidney")
@@ -85,7 +85,7 @@ def main() -> None:
         return
     records = []
     for job, *details in jobs(arguments):
-        # a process of its own: PyOpenGL is bound to one platform for the life of a process
+        # a separate process, because PyOpenGL is bound to one platform for the life of a process
         with ProcessPoolExecutor(1, mp_context=get_context("spawn")) as process:
             try:
                 records.append(process.submit(job, *details).result())
@@ -95,10 +95,10 @@ def main() -> None:
 
 
 def jobs(arguments: argparse.Namespace) -> Iterator[tuple[Any, ...]]:
-    """The measurements asked for: a function and its arguments."""
+    """Yield the function and the arguments of every requested measurement."""
     on_cuda = arguments.device == "cuda"
     actor = arguments.actor or ("size12m" if on_cuda else "cpu_small")
-    # On CUDA what takes a minute or two of a machine that is lent; HYBRID, and more, if they are asked for.
+    # On CUDA the defaults take a minute or two of GPU time; HYBRID and others only on request.
     for images in arguments.images or (("none", "cuda") if on_cuda else ("none", *RENDERERS)):
         state, pixels = ((4096,), (256, 1024, 4096)) if on_cuda else ((32, 512, 2048), (32, 64, 256))
         for num_envs in arguments.num_envs or (state if images == "none" else pixels):
@@ -136,7 +136,7 @@ def measure(
         "total_frames": -1,
         "track_traj_ids": False,
         "no_cuda_sync": True,
-        "device": env.device,  # else the collector makes the data forget its device, and finds it again, every step
+        "device": env.device,  # otherwise the collector clears and restores the data's device at every step
     }
     collector = Collector(env, RandomPolicy(env.action_spec), **options)
     rollouts = iter(collector)
@@ -164,7 +164,7 @@ def measure(
 
 
 def flying(env: DroneRacingEnv, act: Callable[[dict[str, Tensor]], Tensor]) -> Callable[[], None]:
-    """Fly the worlds in plain tensors: act on what is seen, step, reset where an episode ended, see."""
+    """Return a function that flies the worlds in plain tensors: act, step, observe, reset where an episode ended."""
     worlds = env.worlds
     key, observe = ("pixels", worlds.render) if env.from_pixels else ("vector", worlds.vector)
     worlds.reset()
@@ -186,12 +186,12 @@ def flying(env: DroneRacingEnv, act: Callable[[dict[str, Tensor]], Tensor]) -> C
 
 
 def make_policy(env: DroneRacingEnv, size: str) -> DreamerPolicy:
-    """Make an untrained agent's policy."""
+    """Make the policy of an untrained agent."""
     return DreamerV3.make(size, Interface.of(env), device=str(env.device)).policy()
 
 
 def acting(policy: DreamerPolicy, beginning: TensorDictBase) -> Callable[[dict[str, Tensor]], Tensor]:
-    """Act in plain tensors, with the policy's networks and the recurrent state that an environment begins with."""
+    """Return a function that acts in plain tensors, with the policy's networks and a given initial recurrent state."""
     memory = {key: beginning.get(key) for key in ("belief", "state", "previous_action")}
 
     def act(seen: dict[str, Tensor]) -> Tensor:
@@ -203,7 +203,7 @@ def acting(policy: DreamerPolicy, beginning: TensorDictBase) -> Callable[[dict[s
 
 
 def speed(job: Callable[[], Any], steps: int, seconds: float, device: torch.device) -> float:
-    """Steps per second of a job of so many, run for some seconds after once."""
+    """Return the steps per second of a job of ``steps`` steps, repeated for some seconds after one warm-up run."""
     job()
     done, start = 0, now(device)
     while (elapsed := now(device) - start) < seconds:
@@ -213,7 +213,7 @@ def speed(job: Callable[[], Any], steps: int, seconds: float, device: torch.devi
 
 
 def parts_of(env: DroneRacingEnv, job: Callable[[], Any], seconds: float) -> dict[str, float]:
-    """Split a collected step of an environment on CPU, ms."""
+    """Return the time of each part of a collected step on CPU, ms."""
     spent: defaultdict[str, float] = defaultdict(float)
     with watched(env, spent):
         steps, start = 0, time.perf_counter()
@@ -226,7 +226,7 @@ def parts_of(env: DroneRacingEnv, job: Callable[[], Any], seconds: float) -> dic
 
 @contextmanager
 def watched(env: DroneRacingEnv, spent: dict[str, float]) -> Iterator[None]:
-    """Count the time spent in the parts of an environment."""
+    """Add the time spent in the parts of an environment to ``spent`` within the context."""
     simulator, race = env.worlds.simulator, env.worlds.race
 
     def timed(part: str, function: Callable[..., Any]) -> Callable[..., Any]:
@@ -257,7 +257,7 @@ def watched(env: DroneRacingEnv, spent: dict[str, float]) -> Iterator[None]:
 
 
 def peak_gib(device: torch.device) -> float:
-    """Peak resident memory of this process, or what is in use on a CUDA device now (warp's too), GiB."""
+    """Return the peak resident memory of this process, or a CUDA device's memory in use (including warp's), GiB."""
     if device.type == "cuda":
         free, total = torch.cuda.mem_get_info(device)
         return (total - free) / 2**30
@@ -268,12 +268,12 @@ def peak_gib(device: torch.device) -> float:
 
 
 def write_page(paths: list[str]) -> None:
-    """Replace the page's table by the best N of each kind of images, from stored results."""
+    """Replace the page's table by stored results, with the fastest N for each kind of images."""
     records = [record for path in paths for record in json.loads(Path(path).read_text())]
     best: dict[tuple[str, ...], dict[str, Any]] = {}
     for record in records:
         if "device" not in record:
-            continue  # a peer that was measured once
+            continue  # a peer
         key = (record["images"], record["device"], record["machine"])
         if key not in best or record["collector"] > best[key]["collector"]:
             best[key] = record

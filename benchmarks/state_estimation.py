@@ -1,22 +1,22 @@
-"""How much of the simulator's state can be told from the latents of an agent, or of a fresh world model that learns.
+"""Benchmark of how well the simulator's state can be predicted from the latents of an agent or a new world model.
 
     OMP_NUM_THREADS=1 python benchmarks/state_estimation.py runs/circle runs/kidney --json state_estimation.json
     OMP_NUM_THREADS=1 python benchmarks/state_estimation.py runs/kidney --variant "" size.cnn_depth=32 \
         model.learning_rate=2e-3 "loss.world_model=reconstruction loss.image_scale=0.003"
 
-As it stands, an agent flies, sampling, in 64 worlds of which half begin on a line; the state is told from the latents
-with which it acts, 52 worlds to learn from and 12 to measure. So any run can be compared, whatever its replay.
+By default, the agent flies with sampled actions in 64 worlds, half of which begin on a line. A probe predicts the state
+from the latents with which it acts; it trains on 52 worlds and is tested on 12. This works for any run.
 
-With --variant fresh world models learn on the replay of the run, each by a list of overrides of the run's settings, or
-`size.<field>` of the networks' size; no actor is there, windows are drawn as the run draws them, but begin without
-stored latents. The state is told in windows that the run never trains on, the same for all variants. The checkpoint
-must hold a replay, so no best/, and the run must have been given the state (`loss=privileged` or `informed`, or an
-actor whose critic reads it). `error`, `image_error`, `reward_error` and `kl` are what the model's own loss says there,
-`seconds` the process's time in updates.
+With --variant, new world models are trained on the run's replay, without an actor. Each variant is a list of overrides
+of the run's settings, or of the networks' size as `size.<field>`. Windows are sampled as in the run, but begin without
+stored latents. The probe is tested on held-out windows, the same for all variants. The checkpoint must hold a replay
+(`best/` does not), and the run must have recorded the state (`loss=privileged` or `informed`, or an actor whose critic
+reads it). `error`, `image_error`, `reward_error` and `kl` are from the model's own loss on held-out windows, `seconds`
+is the CPU time of updates.
 
-`probe` is the error of a small network that has learned for `SETTLE` updates to tell the state from latents that stand
-still, the mean square of symlogs; `share` is that by their variance, `linear` the share that the best linear map does
-not tell.
+`probe` is the mean squared error of symlogs of a small network, trained for `SETTLE` updates to predict the state from
+fixed latents; `share` is this error over the variance; `linear` is the unexplained share of variance of the best linear
+map.
 """
 
 import gc
@@ -42,9 +42,9 @@ from dreamer_racing.modules.interface import PRIVILEGED, Interface
 from dreamer_racing.modules.layers import autocast
 from dreamer_racing.modules.rssm import CONTEXT
 
-HELD_OUT, LENGTH, RECENT = 128, 32, 4_000  # windows measured, their records, and from how many newest of each world
-WORLDS, MEASURED, STEPS = 64, 12, 704  # flown: worlds, those measured, steps
-SETTLE, BATCHES, MINIBATCH, RIDGE = 2_000, 200, 512, 1e-2  # updates of the probe, batches it learns from, its records
+HELD_OUT, LENGTH, RECENT = 128, 32, 4_000  # held-out windows, their length, and newest records per world they are from
+WORLDS, MEASURED, STEPS = 64, 12, 704  # of flights: worlds, test worlds among them, steps
+SETTLE, BATCHES, MINIBATCH, RIDGE = 2_000, 200, 512, 1e-2  # probe's updates, replay batches, minibatch; ridge penalty
 COLUMNS = ["variant", "updates", "seconds", "probe", "share", "linear", "error", "image_error", "reward_error", "kl"]
 
 
@@ -69,8 +69,8 @@ def main() -> None:
             rows = [{"benchmark": "state_estimation", **trained.where, **record} for record in found]
             print_table(rows, COLUMNS)
             records += rows
-            write_json(records, arguments.json)  # of all so far: a later variant may not fit
-            gc.collect()  # replay and learner, gigabytes, are in cycles
+            write_json(records, arguments.json)  # in case a later variant runs out of memory
+            gc.collect()  # replay and learner take gigabytes and are in reference cycles
 
 
 Shown = tuple[Tensor, Tensor]
@@ -78,7 +78,7 @@ Shown = tuple[Tensor, Tensor]
 
 
 def as_flown(trained: Trained) -> dict[str, Any]:
-    """Return what is told of the state by the latents with which a run's agent flies."""
+    """Return how well the state can be predicted from the latents with which a run's agent flies."""
     env = trained.config.env
     worlds = DroneRacingEnv(
         num_envs=WORLDS,
@@ -99,7 +99,7 @@ def as_flown(trained: Trained) -> dict[str, Any]:
 
 
 def learning(trained: Trained, variant: str, updates: int, every: int) -> Iterator[dict[str, Any]]:
-    """Yield a record for each measurement of a fresh model on the run's replay."""
+    """Train a new model on the run's replay; yield a record for each measurement."""
     config, size = varied(trained.config, variant)
     replay = restore_replay(trained, config)
     held_out = replay.held_out(HELD_OUT, LENGTH, RECENT)  # the same windows for every variant
@@ -110,7 +110,7 @@ def learning(trained: Trained, variant: str, updates: int, every: int) -> Iterat
     context, seconds = autocast(torch.device("cpu"), bool(config.model.mixed_precision)), 0.0
 
     def observed(batch: TensorDictBase) -> tuple[dict[str, Tensor], Latents]:
-        batch.pop(CONTEXT, None)  # the latents of the model that was trained mean nothing to a fresh one
+        batch.pop(CONTEXT, None)  # stored latents of the trained model are meaningless to a new one
         with context:
             return loss(batch)
 
@@ -135,20 +135,20 @@ def learning(trained: Trained, variant: str, updates: int, every: int) -> Iterat
 
 
 def told(learned: Shown, measured: Shown) -> dict[str, float]:
-    """Return what a probe and a linear map do not tell of the state, learned from some latents, on others."""
+    """Fit a probe and a linear map on ``learned``; return their errors on ``measured``."""
     probe = Probe(learned[0].shape[-1], learned[1].shape[-1])
     return settle(probe, learned, measured, SETTLE) | {"linear": linear_share(learned, measured)}
 
 
 class Probe:
-    """A decoder of its own from latents to the state; F features, P privileged numbers."""
+    """A separate decoder from latents (F features) to the state (P privileged numbers)."""
 
     def __init__(self, features: int, privileged: int) -> None:
         self.decoder = VectorDecoder(features, privileged, layers=2, units=256)
         self.optimizer = torch.optim.Adam(self.decoder.parameters(), 1e-3)
 
     def error(self, features: Tensor, state: Tensor) -> Tensor:
-        """Return the mean squared error of symlogs on latents `(..., F)` and the state `(..., P)`, a scalar."""
+        """Return the mean squared error of symlogs for latents `(..., F)` and states `(..., P)`, a scalar."""
         return self.decoder.squared_error(features, state) / state.shape[-1]
 
     def learn(self, features: Tensor, state: Tensor) -> None:
@@ -159,7 +159,7 @@ class Probe:
 
 
 def settle(probe: Probe, learned: Shown, measured: Shown, updates: int) -> dict[str, float]:
-    """Let the probe learn of latents that stand still; return its error on others, and that by their variance."""
+    """Train the probe on fixed latents; return its error on ``measured``, and the error over the variance there."""
     for _ in range(updates):
         drawn = torch.randint(len(learned[0]), (MINIBATCH,))
         probe.learn(*(part[drawn] for part in learned))
@@ -170,8 +170,8 @@ def settle(probe: Probe, learned: Shown, measured: Shown, updates: int) -> dict[
 
 @torch.no_grad()
 def linear_share(learned: Shown, measured: Shown) -> float:
-    """Return the share of the variance of the state's symlogs that the best linear map of the latents does not tell."""
-    # In float64: the probabilities of a latent sum to 1, as the constant does, so that the system is singular.
+    """Return the share of variance of the state's symlogs that the best linear map of the latents does not explain."""
+    # In float64 and with a ridge, because the classes of a latent sum to 1, like the constant: the system is singular.
     latents, others = (F.pad(part[0].double(), (0, 1), value=1.0) for part in (learned, measured))
     state, truth = (symlog(part[1]).double() for part in (learned, measured))
     normal = latents.T @ latents + RIDGE * torch.eye(latents.shape[-1], dtype=torch.float64)
@@ -182,20 +182,20 @@ def linear_share(learned: Shown, measured: Shown) -> float:
 def fresh(
     config: WorldModelRunConfig, size: ModelSize, interface: Interface
 ) -> tuple[WorldModelLoss, torch.optim.Optimizer]:
-    """Make a world-model loss of initial weights, and what trains it."""
+    """Make a world-model loss with initial weights, and its optimiser."""
     losses = DreamerV3Losses(**{field.name: getattr(config.loss, field.name) for field in fields(LossConfig)})
     learner = DreamerV3.make(size, interface, losses, config.model, seed=0)
     return learner.world_model_loss, learner.optimizer
 
 
 def errors(metrics: dict[str, Tensor]) -> dict[str, float]:
-    """Return what the loss's own decoders say, by column."""
+    """Return the errors of the loss's own decoders, by column."""
     names = {"privileged_error": "error", "image_error": "image_error", "reward_error": "reward_error"}
     return {column: metrics[name].item() for name, column in names.items() if name in metrics}
 
 
 def flat(latents: Latents) -> Tensor:
-    """Return the latents that a world-model loss has found, `(M, F)`, without gradient."""
+    """Return features `(M, F)` of the latents from a world-model loss, without gradient."""
     return latents.features.detach().float().flatten(0, 1)
 
 

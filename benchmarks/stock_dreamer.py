@@ -1,20 +1,20 @@
-"""TorchRL's own DreamerV3, timed as ``learner.py`` times ours: one whole update of its stock modules and losses.
+"""Benchmark of TorchRL's own DreamerV3, timed like ours in ``learner.py``: one update of its stock modules and losses.
 
-The assembly is that of TorchRL's recipe, with its numbers: block GRU, strided convolutions, ``DreamerV3Loss`` over the
+The assembly and its numbers are those of TorchRL's recipe: block GRU, strided convolutions, ``DreamerV3Loss`` over the
 three losses and the replayed returns, ``DreamerV3Optimizer``, a slow critic, and ``DreamerV3OptimizationStepper`` with
-its defaults, which are eager on a CPU and a compiled update in a CUDA graph on a GPU. Images are 64×64×3, actions four
-and continuous. The recipe's continuous actor is no class of TorchRL: ``StockActor`` stands for it.
+its defaults, which are eager on a CPU and a compiled update in a CUDA graph on a GPU. Images are 64×64×3, with four
+continuous actions. ``StockActor`` replaces the recipe's continuous actor, which is not a class of TorchRL.
 
     shape   belief  units  latents  CNN depth  parameters  GFLOP (B 8, T 32, H 15)  (B 16, T 64, H 16)
     small      512    128    16×16          8      1.37 M                       26
     large     2048    768    32×32         64      36.8 M                                        3,447
 
-Channels are 1, 2, 4 and 4 times the depth, not TorchRL's default of 2, 3, 4 and 4: those are half again as much work
-in ``large`` (38.4 M parameters, 5,108 GFLOP), and the peer shall not look slow for being wide.
+Channels are 1, 2, 4 and 4 times the depth, not TorchRL's default of 2, 3, 4 and 4, which takes half again as many
+FLOPs in ``large`` (38.4 M parameters, 5,108 GFLOP): a wider peer would look slower than it is.
 
-Each shape has two variants. As TorchRL has it, imagination records a graph that REINFORCE never uses, and products are
-at the highest float32 precision. ``tuned`` imagines without gradients, which TorchRL has no option for, sets
-``float32_matmul_precision`` to high, on a GPU to medium (which a CPU with AMX would take for bfloat16), and keeps freed
+Each shape has two variants. The stock variant records a graph in imagination that REINFORCE never uses, and multiplies
+at the highest float32 precision. ``tuned`` imagines without gradients, for which TorchRL has no option, sets
+``float32_matmul_precision`` to high, on a GPU to medium (on a CPU with AMX, medium would mean bfloat16), keeps freed
 memory as ``learner.py`` does for ours, and on a GPU trains in bfloat16.
 
 Shape legend: B batch, T time, H horizon.
@@ -59,21 +59,21 @@ IMAGE = (3, 64, 64)  # channels first, pixels
 ACTION_DIM = 4
 CNN_MULTIPLIERS = (1, 2, 4, 4)
 UNIMIX = 0.01
-CONTINUATION_HORIZON = 333.0  # steps; the discount lives in the continuation's targets, hence gamma = 1
+CONTINUATION_HORIZON = 333.0  # steps; the discount is in the continuation's targets, hence gamma = 1
 LATENT = ["belief", "state"]
 NEXT_LATENT = [("next", "belief"), ("next", "state")]
 
 
 @dataclass(frozen=True)
 class StockShape:
-    """Widths of TorchRL's networks; their depths are the recipe's.
+    """Widths of TorchRL's networks, whose depths are those of the recipe.
 
     Attributes:
         belief: Width of the block GRU's state.
         units: Width of the hidden layers of RSSM and heads.
         latents: Number of categorical latents.
-        classes: Classes of each.
-        cnn_depth: Channels of a convolution are ``CNN_MULTIPLIERS`` times as many.
+        classes: Number of classes per latent.
+        cnn_depth: Unit of a convolution's channels, which are ``CNN_MULTIPLIERS`` times as many.
     """
 
     belief: int
@@ -84,12 +84,12 @@ class StockShape:
 
     @property
     def state(self) -> int:
-        """Width of the stochastic state: flattened one-hots."""
+        """Width of the stochastic state, flattened one-hots."""
         return self.latents * self.classes
 
     @property
     def features(self) -> int:
-        """Width of what the heads read."""
+        """Input width of the heads."""
         return self.belief + self.state
 
 
@@ -111,13 +111,13 @@ def measure_stock(
     """Time updates of one shape and variant; return one record with the columns of ``learner.py``.
 
     Args:
-        batch: Sequences B and their length T.
+        batch: Number of sequences B and their length T.
         horizon: Imagined steps from each of the B T states.
-        device: Where to train.
-        threads: Torch's threads.
-        updates: How many to time, after 3 of warm-up.
+        device: Device of the update.
+        threads: Number of torch threads.
+        updates: Number of timed updates, after 3 of warm-up.
         shape: Key of ``SHAPES``.
-        tuned: Imagine without gradients, at high or medium precision.
+        tuned: Whether to time the ``tuned`` variant.
     """
     torch.set_num_threads(threads)
     cuda = device.startswith("cuda")
@@ -149,7 +149,7 @@ def measure_stock(
 
 
 class StockActor(nn.Module):
-    """Bounded Normal over actions: mean and standard deviation as in TorchRL's recipe."""
+    """Normal distribution over actions, with mean and standard deviation as in TorchRL's recipe."""
 
     def __init__(self, shape: StockShape) -> None:
         super().__init__()
@@ -162,7 +162,7 @@ class StockActor(nn.Module):
 
 
 class GradientFreeEnv(DreamerEnv):
-    """Imagination of which autograd records nothing; REINFORCE needs no path through it."""
+    """Imagination without an autograd graph, which REINFORCE does not need."""
 
     @torch.no_grad()
     def rollout(self, *args: Any, **kwargs: Any) -> TensorDict:
@@ -171,7 +171,7 @@ class GradientFreeEnv(DreamerEnv):
 
 
 def make_stepper(shape: StockShape, horizon: int, device: str, tuned: bool = False) -> DreamerV3OptimizationStepper:
-    """Assemble losses, optimiser and slow critic on a device."""
+    """Build losses, optimiser and slow critic on a device."""
     losses = make_losses(shape, horizon, device, tuned)
     slow_critic = SoftUpdate(losses.value_loss, tau=0.02)
     trained = [
@@ -183,7 +183,7 @@ def make_stepper(shape: StockShape, horizon: int, device: str, tuned: bool = Fal
 
 
 def make_losses(shape: StockShape, horizon: int, device: str, tuned: bool = False) -> DreamerV3Loss:
-    """Assemble the networks and the whole objective on a device."""
+    """Build the networks and all losses on a device."""
     prior = RSSMPriorV3(
         action_shape=(ACTION_DIM,), action_dim=ACTION_DIM, hidden_dim=shape.units, rnn_hidden_dim=shape.belief,
         num_categoricals=shape.latents, num_classes=shape.classes, recurrent_model="block_gru", unimix=UNIMIX,
@@ -216,7 +216,7 @@ def make_losses(shape: StockShape, horizon: int, device: str, tuned: bool = Fals
 
 
 def head(network: nn.Module, in_keys: list[Any], out_key: Any) -> tuple[TensorDictModule, TensorDictModule]:
-    """Return a network between keys and, as in the recipe, a cast of its output to float32."""
+    """Return a network as a module on keys and, as in the recipe, a cast of its output to float32."""
     return (
         TensorDictModule(network, in_keys=in_keys, out_keys=[out_key]),
         TensorDictModule(Tensor.float, in_keys=[out_key], out_keys=[out_key]),
@@ -293,7 +293,7 @@ def make_imagination(
 
 
 def make_sample(shape: StockShape, batch: tuple[int, int], device: str) -> TensorDict:
-    """Return random sequences [B, T] under TorchRL's keys; all start from latents of zero."""
+    """Return random sequences [B, T] with TorchRL's keys; all start from latents of zero."""
     records = random_rollout(*batch)
     following = records["next"].select("reward", "terminated")
     following["done"] = following["terminated"].clone()
@@ -303,7 +303,7 @@ def make_sample(shape: StockShape, batch: tuple[int, int], device: str) -> Tenso
 
 
 class FlopCounter(TorchDispatchMode):
-    """Sum of torch's FLOP formulas; ``FlopCounterMode`` itself stumbles over the ``TensorDictParams`` of the losses."""
+    """Counter by torch's FLOP formulas; ``FlopCounterMode`` itself fails on the ``TensorDictParams`` of the losses."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -318,7 +318,7 @@ class FlopCounter(TorchDispatchMode):
 
 
 def count_flops(stepper: DreamerV3OptimizationStepper, sample: TensorDict) -> int:
-    """Count the FLOPs of the losses and their gradients in one more eager pass; nothing is trained by it."""
+    """Count the FLOPs of the losses and their gradients in an additional eager pass, without an optimiser step."""
     with FlopCounter() as counter:
         losses = stepper.loss_module(sample)
         torch.stack([value for key, value in losses.items() if key.startswith("loss_")]).sum().backward()

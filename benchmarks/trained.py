@@ -1,4 +1,4 @@
-"""Trained dreamer_v3 agents and their replay, brought back on a CPU for what is measured of them."""
+"""Restoring of trained world-model agents and their replay on a CPU, for benchmarks."""
 
 import sys
 from dataclasses import replace
@@ -26,7 +26,7 @@ __all__ = ["Trained", "WorldModelRunConfig", "fly", "make_env", "restore", "rest
 
 
 class Trained(NamedTuple):
-    """A run's settings for a CPU, its learner with the trained weights (not the averaged ones), and where it was."""
+    """A run's settings for a CPU, its learner with trained (not averaged) weights, its checkpoint and its origin."""
 
     config: WorldModelRunConfig
     learner: WorldModelLearner
@@ -35,10 +35,10 @@ class Trained(NamedTuple):
 
 
 def restore(path: str) -> Trained:
-    """Bring back the latest checkpoint of a run directory, or a checkpoint.
+    """Restore a checkpoint, or the latest checkpoint of a run directory.
 
     Raises:
-        SystemExit: It is of another algorithm.
+        SystemExit: The algorithm has no world model.
     """
     checkpoint = latest_checkpoint(path)
     run = RunDirectory.of(checkpoint)
@@ -58,9 +58,9 @@ def restore(path: str) -> Trained:
 
 
 def restore_replay(trained: Trained, config: WorldModelRunConfig | None = None) -> StreamReplay:
-    """Bring back the replay of a checkpoint that holds one (not `best/`), sampled as the run, or `config`, does."""
+    """Restore the replay of a checkpoint (`best/` has none), sampled as configured by the run or by ``config``."""
     config = config or trained.config
-    env = make_env(replace(config, env=replace(config.env, start_on_line=0.0)), num_envs=1)  # for what it shows
+    env = make_env(replace(config, env=replace(config.env, start_on_line=0.0)), num_envs=1)  # for its specs
     curriculum = make_curriculum(config, env)
     latents = trained.learner.latent_format if config.replay.context else None
     replay = make_run_replay(config, env, curriculum, (config.model.batch_size, config.model.batch_length), latents)
@@ -71,10 +71,10 @@ def restore_replay(trained: Trained, config: WorldModelRunConfig | None = None) 
 
 @torch.no_grad()
 def fly(learner: WorldModelLearner, env: Environment, steps: int) -> TensorDict:
-    """Fly the stochastic policy for K steps of N worlds; return what came of it, batch ``[K, N]``.
+    """Fly the stochastic policy for K steps in N worlds; return the records, batch ``[K, N]``.
 
-    ``belief`` and ``state`` are the latents with which it acted, ``reward`` and ``done`` what the step led to, and
-    ``vector``, if the worlds tell it, the simulator's state that it acted in.
+    ``belief`` and ``state`` are the latents with which the policy acted, ``reward`` and ``done`` the results of the
+    step, and ``vector`` the simulator's state before it, if the worlds provide it.
     """
     policy, records = learner.policy(), []
     remembering = with_memory(env, policy.make_primer())

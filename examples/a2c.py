@@ -1,4 +1,4 @@
-"""A2C of stock TorchRL on the Circle track, from the 21 numbers of `vector`: `python examples/a2c.py`."""
+"""TorchRL's A2C on the Circle track, with the 21 numbers of `vector` as observation: `python examples/a2c.py`."""
 
 import argparse
 

@@ -1,4 +1,4 @@
-"""PPO in one file, as CleanRL has it, in a Gymnasium vector environment: `python examples/cleanrl.py`."""
+"""PPO in one file in the style of CleanRL, with a Gymnasium vector environment: `python examples/cleanrl.py`."""
 
 import argparse
 import math
@@ -33,7 +33,7 @@ CIRCLE = {"id": "dreamer_racing:dreamer_racing/Circle-v0", "observation": "vecto
 
 
 def layer(inputs: int, outputs: int, scale: float = math.sqrt(2.0)) -> nn.Linear:
-    """An orthogonal layer."""
+    """Return a linear layer with orthogonal weights and zero bias."""
     linear = nn.Linear(inputs, outputs)
     nn.init.orthogonal_(linear.weight, scale)
     nn.init.zeros_(linear.bias)
@@ -41,12 +41,12 @@ def layer(inputs: int, outputs: int, scale: float = math.sqrt(2.0)) -> nn.Linear
 
 
 def mlp(outputs: int, scale: float) -> nn.Sequential:
-    """Two hidden layers, and an output layer of another scale."""
+    """Return an MLP with two hidden layers and an output layer of the given scale."""
     return nn.Sequential(layer(21, 128), nn.Tanh(), layer(128, 128), nn.Tanh(), layer(128, outputs, scale))
 
 
 class Agent(nn.Module):
-    """A normal distribution of actions, whose deviation does not depend on what is seen, and a critic."""
+    """A policy with normally distributed actions of state-independent standard deviation, and a critic."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -54,11 +54,11 @@ class Agent(nn.Module):
         self.log_std = nn.Parameter(torch.full((4,), -0.5))
 
     def policy(self, observation: torch.Tensor) -> Normal:
-        """Of actions (..., 4) where this is seen (..., 21)."""
+        """Return the distribution of actions (..., 4) for observations (..., 21)."""
         return Normal(self.mean(observation), self.log_std.exp())
 
     def value(self, observation: torch.Tensor) -> torch.Tensor:
-        """Of what is seen (..., 21), in units of the scaled reward (...)."""
+        """Return the values (...) of observations (..., 21), in units of the scaled reward."""
         return self.critic(observation).squeeze(-1)
 
 
@@ -73,7 +73,7 @@ actions, log_probs = torch.zeros(*shape, 4), torch.zeros(shape)
 rewards, terminated, truncated, flown = (torch.zeros(shape) for _ in range(4))
 
 observations[-1] = torch.from_numpy(envs.reset(seed=arguments.seed)[0])
-begins = torch.zeros(arguments.num_envs)  # where the last step ended an episode: the next one only begins another
+begins = torch.zeros(arguments.num_envs)  # 1 where the last step ended an episode, so that the next one only resets
 updates = -(-arguments.env_steps // (shape[0] * shape[1]))
 returns, gates = [], []
 for update in range(1, updates + 1):
@@ -96,7 +96,7 @@ for update in range(1, updates + 1):
             returns.append(infos["episode"]["r"][ended])
             gates.append(infos["gates_passed"][ended])
 
-    # Advantages. An episode's last observation is there, so that out of time is no crash: it has a value, too.
+    # Advantages. An episode's last observation is available, so that a truncated episode bootstraps from its value.
     with torch.no_grad():
         values = agent.value(observations)  # (T + 1, N)
         errors = rewards + arguments.gamma * values[1:] * (1.0 - terminated) - values[:-1]
@@ -132,7 +132,7 @@ envs.close()
 
 
 def race(deterministic: bool) -> str:
-    """Fly three laps from 100 starts with noise, by sampled actions or by the mean of what the race clips; say how."""
+    """Fly three laps from 100 noisy starts with sampled actions or the mean of clipped actions; return the result."""
     envs = gymnasium.make_vec(**CIRCLE, num_envs=100, evaluation=True, start_noise=1.0)
     seen, _ = envs.reset(seed=1)
     flying, finished, laps = np.ones(100, bool), 0, []

@@ -1,4 +1,4 @@
-"""The race as a dm_control environment, wrapped by TorchRL: `python examples/dm_control_wrapper.py`."""
+"""Collect episodes of the race as a dm_control environment with TorchRL: `python examples/dm_control_wrapper.py`."""
 
 import argparse
 
@@ -21,12 +21,12 @@ rollout = race.rollout(1000)  # random actions, until the drone crashes
 print(f"{len(rollout)} steps, crashed: {rollout['next', 'terminated'][-1].item()}")
 print({name: tuple(value.shape) for name, value in rollout["next"].items()})
 
-# dm_control's numbers are float64 and lie under a key each: what networks want is one float32 vector.
+# dm_control's observations are separate float64 entries; networks need one float32 vector.
 state = ["position", "attitude", "linear_velocity", "body_rates"]
 transforms = Compose(DoubleToFloat(), CatTensors(state, out_key="observation"), RewardSum(), InitTracker())
 policy = TensorDictModule(nn.Sequential(MLP(13, 4, num_cells=[64, 64]), nn.Tanh()), ["observation"], ["action"])
 collector = Collector(TransformedEnv(race, transforms), policy, frames_per_batch=500, total_frames=arguments.env_steps)
-for batch in collector:  # (500,), episodes one after the other
+for batch in collector:  # (500,), consecutive episodes
     ended = batch["next"][batch["next", "done"].squeeze(-1)]
     print(f"{len(ended)} episodes, returns {[round(value, 1) for value in ended['episode_reward'].flatten().tolist()]}")
 collector.shutdown()

@@ -1,4 +1,4 @@
-"""PPO of stock TorchRL on the Circle track, from the 21 numbers of `vector`: `python examples/ppo.py`."""
+"""TorchRL's PPO on the Circle track, with the 21 numbers of `vector` as observation: `python examples/ppo.py`."""
 
 import argparse
 import math
@@ -32,7 +32,7 @@ race.body_rate_weight = 0.01  # b₂ of the reward: whoever turns less flies mor
 env = TransformedEnv(race, Compose(RewardSum(), RewardScaling(0.0, 0.1), InitTracker()))  # `episode_reward` as it was
 network = {"num_cells": [128, 128], "activation_class": nn.Tanh}
 normal = nn.Sequential(MLP(21, 4, **network), AddStateIndependentNormalScale(4, init_value=math.log(0.6)))
-normal[0][-1].weight.data *= 0.01  # begins with actions near 0, which is a little more thrust than it takes to hover
+normal[0][-1].weight.data *= 0.01  # initial actions are near 0: slightly more than hover thrust
 actor = ProbabilisticActor(
     TensorDictModule(normal, ["vector"], ["loc", "scale"]),
     in_keys=["loc", "scale"],
@@ -69,7 +69,7 @@ for index, rollout in enumerate(collector):  # (512, 32)
         print(f"{flown} steps: return {ended['episode_reward'].mean():.1f}, {gates:.1f} gates an episode", flush=True)
 collector.shutdown()
 
-# Three laps from 100 starts with noise, by sampled actions and by the mean of what the race clips.
+# Three laps from 100 noisy starts, with sampled actions and with the mean of clipped actions.
 mean = TensorDictModule(clipped_mean, ["loc", "scale"], ["action"])
 flyers = {"sampled": actor, "clipped mean": TensorDictSequential(actor[0], mean)}
 for name, flyer in flyers.items():

@@ -23,7 +23,7 @@ arguments = parser.parse_args()
 
 
 class Progress(BaseCallback):
-    """Prints what the latest hundred episodes came to."""
+    """Prints mean return and gates of the latest hundred episodes."""
 
     def _on_step(self) -> bool:
         return True
@@ -55,21 +55,21 @@ drones.close()
 
 
 class ClippedMeanActions:
-    """The agent by the mean of what the race clips; `deterministic=True` is the normal's, which lies beyond."""
+    """The agent with the mean of clipped actions; `deterministic=True` would give the unclipped normal's mean."""
 
     def predict(self, observation: Any, state: Any = None, **_: Any) -> Any:
-        """As `PPO.predict`."""
+        """Return actions and state, as `PPO.predict` does."""
         with torch.no_grad():
             normal = agent.policy.get_distribution(agent.policy.obs_to_tensor(observation)[0]).distribution
             return clipped_mean(normal.mean, normal.stddev).cpu().numpy(), state
 
 
 def race(flyer: Any) -> str:
-    """Fly three laps from 100 starts with noise, and say how."""
+    """Fly three laps from 100 noisy starts; return the result as text."""
     laps, finished = [], []
 
     def note(step: dict[str, Any], _: dict[str, Any]) -> None:
-        """Read a drone's step off what the evaluation knows."""
+        """Record a drone's lap times and finish from the evaluation's local variables."""
         if step["info"]["lap_time"]:
             laps.append(step["info"]["lap_time"])
         if step["done"]:

@@ -1,4 +1,4 @@
-"""TD3 of stock TorchRL on the Circle track, from the 21 numbers of `vector`: `python examples/td3.py`."""
+"""TorchRL's TD3 on the Circle track, with the 21 numbers of `vector` as observation: `python examples/td3.py`."""
 
 import argparse
 

@@ -1,3 +1,3 @@
-"""Flying a policy and measuring it, and its world model."""
+"""Evaluation of policies and of their world models."""
 
 import dreamer_racing.envs  # noqa: F401 - heeds MUJOCO_GL before TorchRL imports MuJoCo

@@ -1,7 +1,7 @@
-"""A person at the sticks: a policy of one drone that acts as a keyboard, a gamepad or a script says.
+"""Manual flight: a policy of one drone that follows a keyboard, a gamepad or a script.
 
-The sticks ask for body rates and thrust, as a radio does that flies acro (mode 2): a centred stick asks for no rate,
-and a centred throttle for the thrust that holds a level drone.
+The sticks command body rates and thrust, as a radio in acro mode does (mode 2): a centred stick commands zero rate,
+and a centred throttle the hover thrust.
 """
 
 from __future__ import annotations
@@ -22,14 +22,14 @@ from dreamer_racing.commands import install_extra
 
 KINDS = ("keyboard", "gamepad")
 WINDOW = 512  # pixels, side of the window
-KEYBOARD_SHARE = 0.35  # of the largest rates and thrust, at a key held down: keys know of no half way
-EASE = 0.25  # share of the way to where the keys are that the sticks go in a control step
+KEYBOARD_SHARE = 0.35  # stick position of a key held down; below 1, because keys are all or nothing
+EASE = 0.25  # share of the remaining way that the sticks move towards the keys in a control step
 DEAD_ZONE = 0.06  # of a gamepad's stick
-GAMEPAD_AXES = {"yaw": 0, "throttle": 1, "roll": 2, "pitch": 3}  # mode 2; SDL counts up and forward as −1
+GAMEPAD_AXES = {"yaw": 0, "throttle": 1, "roll": 2, "pitch": 3}  # mode 2; in SDL, up and forward are −1
 
 
 class StickPositions(NamedTuple):
-    """Where the sticks are, each in [−1, 1]."""
+    """Stick positions, each in [−1, 1]."""
 
     roll: float = 0.0
     """+ to the right."""
@@ -38,23 +38,23 @@ class StickPositions(NamedTuple):
     yaw: float = 0.0
     """+ to the right."""
     throttle: float = 0.0
-    """0 holds a level drone, ±1 is all and nothing."""
+    """0 is hover thrust, +1 full thrust, −1 no thrust."""
 
 
 Sticks = Callable[[np.ndarray], StickPositions]
-"""Shows an on-board image (H, W, 3) uint8 to the one who flies, and says where the sticks are."""
+"""Function that shows an on-board image (H, W, 3) uint8 to the pilot and returns the stick positions."""
 
 
 class FlightAbandonedError(Exception):
-    """The one who flies has closed the window or pressed escape."""
+    """The pilot has closed the window or pressed escape."""
 
 
 class HandPolicy(TensorDictModuleBase):
-    """Acts as sticks say: reads `pixels` of one drone, writes `action`.
+    """Policy that follows sticks: reads `pixels` of one drone, writes `action`.
 
     Args:
-        sticks: who flies.
-        hover_action: collective thrust, in units of the action, that holds a level drone.
+        sticks: the source of stick positions.
+        hover_action: collective thrust of hover, in units of the action.
 
     Example:
         >>> from tensordict import TensorDict
@@ -69,7 +69,7 @@ class HandPolicy(TensorDictModuleBase):
         self._sticks, self._hover = sticks, hover_action
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Write the action of the coming control step."""
+        """Write the action of the next control step."""
         at = self._sticks(tensordict["pixels"][0].cpu().numpy())
         room = 1.0 - self._hover if at.throttle > 0 else 1.0 + self._hover
         action = [self._hover + room * at.throttle, at.roll, at.pitch, -at.yaw]
@@ -77,12 +77,12 @@ class HandPolicy(TensorDictModuleBase):
 
 
 def keys_to_sticks(held: Mapping[str, bool], before: StickPositions) -> StickPositions:
-    """Move the sticks towards what keys ask for.
+    """Move the sticks towards the positions that the keys command.
 
     Args:
         held: whether ``left``, ``right``, ``up``, ``down`` (roll and pitch), ``a``, ``d`` (yaw), ``w``, ``s``
-            (throttle) are held down; those that are missing are not.
-        before: where the sticks were a control step ago.
+            (throttle) are held down; missing keys are not.
+        before: the stick positions one control step ago.
     """
     pairs = (("right", "left"), ("up", "down"), ("d", "a"), ("w", "s"))
     wanted = [KEYBOARD_SHARE * (bool(held.get(more)) - bool(held.get(less))) for more, less in pairs]
@@ -90,20 +90,20 @@ def keys_to_sticks(held: Mapping[str, bool], before: StickPositions) -> StickPos
 
 
 def axes_to_sticks(axes: Mapping[str, float]) -> StickPositions:
-    """Read a gamepad: up and forward are negative there; what is near the centre is the centre."""
+    """Convert gamepad axes, whose up and forward are negative, and apply the dead zone."""
     live = {name: 0.0 if abs(value) < DEAD_ZONE else value for name, value in axes.items()}
     return StickPositions(live["roll"], -live["pitch"], live["yaw"], -live["throttle"])
 
 
 def check_by_hand(kind: str, environment: Mapping[str, str] = os.environ) -> None:
-    """Refuse to fly by hand where nobody could.
+    """Check that pygame and a display are available.
 
     Args:
         kind: ``keyboard`` or ``gamepad``.
-        environment: the environment variables to judge.
+        environment: the environment variables.
 
     Raises:
-        ValueError: pygame is not installed, or there is no display; the message says what would help.
+        ValueError: pygame is not installed, or there is no display; the message names the remedy.
     """
     if importlib.util.find_spec("pygame") is None:
         raise ValueError(f"pilot={kind} needs the package pygame: {install_extra('play')}.")
@@ -116,7 +116,7 @@ def check_by_hand(kind: str, environment: Mapping[str, str] = os.environ) -> Non
 
 
 class PygameSticks:
-    """A window with the on-board image, and a keyboard or a gamepad; keeps a flight at the speed of time.
+    """A window with the on-board image, and a keyboard or a gamepad; runs a flight in real time.
 
     Arrows: roll and pitch. A and D: yaw. W and S: throttle. Escape ends the flight.
 
@@ -136,7 +136,7 @@ class PygameSticks:
         self._control_dt, self._due = control_dt, time.monotonic()
         self._at = StickPositions()
         pygame.display.init()
-        pygame.joystick.init()  # and not what plays sounds: without a sound card that says a dozen errors
+        pygame.joystick.init()  # not pygame.init(): without a sound card it prints many errors
         self._gamepad = None
         if kind == "gamepad":
             if not pygame.joystick.get_count():

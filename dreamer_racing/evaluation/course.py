@@ -1,4 +1,4 @@
-"""Where a policy is flown: worlds to evaluate in, with what the policy needs beside observations.
+"""Environments for evaluation, with the recurrent state that a policy needs.
 
 Shapes: N environments.
 """
@@ -18,24 +18,24 @@ from dreamer_racing.learners.learner import Policy
 
 
 def act(policy: Policy, tensordict: TensorDictBase) -> TensorDictBase:
-    """Act wherever the policy lives, with worlds that live where their data are: on the CPU, if those do not say."""
+    """Run the policy on its own device and move the result to the environment's device (the CPU if it has none)."""
     weight = next(cast(torch.nn.Module, policy).parameters(), torch.zeros(()))
     return policy(tensordict.to(weight.device)).to(tensordict.device or "cpu")
 
 
 class Course:
-    """Worlds to evaluate a policy in, as often as wanted.
+    """Environments in which a policy can be evaluated repeatedly.
 
-    Each time it meets the same starts, drones and looks in the first episode of every world; in later ones, where
-    ``num_envs`` makes worlds fewer than episodes, they depend on how the episodes before went. What a policy samples
-    comes from torch's generator.
+    Every evaluation has the same starts, drones and looks in the first episode of each environment. If ``num_envs`` is
+    less than ``episodes``, those of later episodes depend on the episodes before. Samples of the policy come from
+    torch's global generator.
 
     Args:
-        policy: what is flown, on whichever device it is.
-        worlds: arguments of ``DroneRacingEnv``: track, preset, renderer, camera, seed (0 if they do not say), device
-            (the CPU if they do not say) ...
-        episodes: E, of an evaluation.
-        num_envs: N, worlds that they are flown in side by side, at most E; None: one for each episode.
+        policy: the policy, on any device.
+        worlds: arguments of ``DroneRacingEnv``: track, preset, renderer, camera, seed (default 0), device (default: the
+            CPU) ...
+        episodes: E, number of episodes per evaluation.
+        num_envs: N, number of parallel environments, at most E; None: one for each episode.
     """
 
     def __init__(self, policy: Policy, worlds: Mapping[str, Any], episodes: int, num_envs: int | None = None) -> None:
@@ -47,11 +47,11 @@ class Course:
         self._env = with_memory(self.base, policy.make_primer())
 
     def evaluate(self, deterministic: bool = True, **recording: Any) -> Evaluation:
-        """Fly the episodes; ``recording`` are arguments of ``evaluate``."""
+        """Run the episodes; ``recording`` are arguments of ``evaluate``."""
         self._policy.deterministic = deterministic
         self.base.worlds.seed(self._seed)
         return evaluate(self._env, lambda tensordict: act(self._policy, tensordict), self._episodes, **recording)
 
     def close(self) -> None:
-        """Free the simulators."""
+        """Close the simulators."""
         self._env.close(raise_if_closed=False)

@@ -1,7 +1,7 @@
-"""What a world model sees, reconstructs and imagines, stored small beside an evaluation to be shown later.
+"""Observed, reconstructed and imagined images of a world model, stored compactly with an evaluation for display.
 
 Shapes: W windows of T stored frames, H × W pixels, RGB, uint8; C frames of context; K control steps of an episode;
-B stretches of a flight, D belief, S state of a world model.
+B segments of a flight, D belief, S state of a world model.
 """
 
 from __future__ import annotations
@@ -28,35 +28,35 @@ if TYPE_CHECKING:
     from dreamer_racing.learners.update import WorldModelLearner
 
 Painter = Callable[[Tensor, Tensor, Tensor], Tensor]
-"""Images uint8 ``(B, T, H, W, 3)`` of beliefs ``(B, T, D)``, states ``(B, T, S)`` and target gates int64 ``(B, T)``."""
+"""Maps beliefs ``(B, T, D)``, states ``(B, T, S)``, target gates int64 ``(B, T)`` to uint8 ``(B, T, H, W, 3)``."""
 
-SEEN_FRAMES, PREDICTED_FRAMES = 3, 10  # that are stored: seen by the model, then predicted on its own
-FARTHEST = 100.0  # largest number of a race vector that is drawn, of its order-one units [choice]
-STRIDE = 4  # control steps from one stored frame to the next: noisy images of a young model take 10 KB each
+SEEN_FRAMES, PREDICTED_FRAMES = 3, 10  # stored frames: observed by the model, then predicted open loop
+FARTHEST = 100.0  # clips decoded race vectors, whose entries are of order one [choice]
+STRIDE = 4  # control steps per stored frame; the noisy images of a barely trained model take 10 KB each
 
 
 @dataclass(frozen=True)
 class Dream:
-    """Windows of a flight: what the camera saw, what the model made of it, and what it imagined."""
+    """Windows of a flight: camera images, the model's reconstructions, and its open-loop predictions."""
 
     real: np.ndarray
     """(W, T, H, W, 3)."""
     reconstructed: np.ndarray
-    """(W, T, H, W, 3): drawn from latents that saw every image up to and including this one."""
+    """(W, T, H, W, 3): from posterior latents, which depend on all images up to and including this one."""
     imagined: np.ndarray
-    """(W, T, H, W, 3): likewise in the context, then predicted from the actions alone."""
+    """(W, T, H, W, 3): reconstructed within the context, then predicted from the actions alone."""
     context: int
-    """C: frames of each window that the model saw before it imagined."""
+    """C: frames of each window that the model observed before it predicted."""
     frame_dt: float
-    """From one frame to the next, s."""
+    """Time between frames, s."""
     from_pose: bool = False
-    """Whether the model's images are views from the pose that it decodes, instead of images that it decodes."""
+    """Whether the model's images are rendered from a decoded pose, not decoded directly."""
 
     def save(self, path: str | Path) -> None:
-        """Write a compressed `.npz`; a kill leaves none or a whole one."""
+        """Write a compressed `.npz` atomically."""
         Path(path).parent.mkdir(parents=True, exist_ok=True)
         partial = Path(path).with_name(f".{Path(path).name}.partial.npz")
-        predicted = self.imagined[:, self.context :]  # before that, it is the reconstruction
+        predicted = self.imagined[:, self.context :]  # the context equals the reconstruction
         np.savez_compressed(
             partial,
             real=self.real,
@@ -70,11 +70,11 @@ class Dream:
 
     @classmethod
     def load(cls, path: str | Path) -> Dream:
-        """Read what `save` wrote.
+        """Read a file written by `save`.
 
         Raises:
-            ValueError: this is no such file.
-            OSError: it cannot be read.
+            ValueError: the file is of another kind or incomplete.
+            OSError: the file cannot be read.
         """
         try:
             with np.load(path) as file:
@@ -88,24 +88,24 @@ class Dream:
 
 
 class BelievedView:
-    """Draws what the camera would see where a world model that decodes the race's state believes the drone to be.
+    """Painter for world models that decode the race vector: renders the camera image at the decoded pose.
 
     Args:
-        decoder: Of the race vector, from features.
-        worlds: Whose hall is drawn.
+        decoder: Decoder of the race vector from features.
+        worlds: Environments that render the scene.
     """
 
-    NEIGHBOURS = (0, -1, 1)  # the model may have passed a gate earlier or later than the flight did
-    PREFERENCE = 0.01  # misfit by which a neighbour must be better, for gates may look alike [choice]
+    NEIGHBOURS = (0, -1, 1)  # the model may predict a gate pass earlier or later than in the flight
+    PREFERENCE = 0.01  # a neighbouring gate must fit better by this misfit, because gates may look alike [choice]
 
     def __init__(self, decoder: VectorDecoder, worlds: RaceWorlds) -> None:
         self._decoder, self._worlds = decoder, worlds
 
     @torch.no_grad()
     def __call__(self, belief: Tensor, state: Tensor, target_gate: Tensor) -> Tensor:
-        """Draw, as every ``Painter``."""
+        """Return the images, as every ``Painter`` does."""
         vector = self._decoder(torch.cat((belief, state), -1)).flatten(0, 1).to(self._worlds.device)
-        vector = vector.nan_to_num(0.0).clamp(-FARTHEST, FARTHEST)  # of a model that has not learned yet
+        vector = vector.nan_to_num(0.0).clamp(-FARTHEST, FARTHEST)  # an untrained model's
         gate, count = target_gate.flatten().to(vector.device), self._worlds.track.num_gates
         poses = [self._worlds.race_vector.pose(vector, (gate + offset) % count) for offset in self.NEIGHBOURS]
         position, attitude, misfit = (torch.stack(parts) for parts in zip(*poses, strict=True))
@@ -116,7 +116,7 @@ class BelievedView:
 
 
 def find_painter(learner: WorldModelLearner, worlds: RaceWorlds) -> Painter | None:
-    """Return what shows a learner's latents: its image decoder, or a view from the pose that it decodes, or nothing."""
+    """Return the image decoder of a learner, else a `BelievedView` if it decodes the race vector, else None."""
     model = learner.agent.world_model
     if model.decoder is not None:
         return lambda belief, state, _: model.images(belief, state)
@@ -130,20 +130,20 @@ def find_painter(learner: WorldModelLearner, worlds: RaceWorlds) -> Painter | No
 def dream(
     learner: WorldModelLearner, trajectory: Trajectory, painter: Painter, parts: list[slice], context: int | None = None
 ) -> Tensor:
-    """Let a world model see the first records of stretches of a flight, and predict the others from its actions.
+    """Let a world model observe the first records of segments of a flight and predict the rest from the actions.
 
     Args:
-        learner: Whose world model.
+        learner: The learner with the world model.
         trajectory: A recorded episode with images.
-        painter: What shows its latents.
-        parts: Stretches, of one length T.
-        context: Records that it sees; None: all.
+        painter: Function from latents to images.
+        parts: Segments of equal length T.
+        context: Number of records observed; None: all.
 
     Returns:
-        Images uint8 ``(B, T, H, W, 3)``, one row a stretch.
+        Images uint8 ``(B, T, H, W, 3)``, one row per segment.
     """
     assert trajectory.pixels is not None
-    action = torch.nn.functional.pad(trajectory.action, (0, 0, 1, 0))  # (K + 1, A) the action that led here
+    action = torch.nn.functional.pad(trajectory.action, (0, 0, 1, 0))  # (K + 1, A) action before each row
     flight = {"pixels": trajectory.pixels, "previous_action": action, "target_gate": trajectory.target_gate}
     beside = {"imu": trajectory.imu, "vector": trajectory.vector}
     flight |= {name: numbers for name, numbers in beside.items() if numbers is not None}
@@ -158,16 +158,16 @@ def dream(
 def record_dream(
     learner: WorldModelLearner, trajectory: Trajectory, painter: Painter | None, windows: int = 1
 ) -> Dream | None:
-    """Let a world model reconstruct and imagine stretches of a flight.
+    """Let a world model reconstruct and imagine windows of a flight.
 
     Args:
-        learner: whose world model.
+        learner: the learner with the world model.
         trajectory: a recorded episode with images.
-        painter: what shows its latents; None where nothing does.
-        windows: W at most; they begin at even distances.
+        painter: function from latents to images, see `find_painter`.
+        windows: maximum of W; windows are evenly spaced.
 
     Returns:
-        The dream; None if nothing shows it or the flight is too short.
+        The dream; None without a painter or images, or if the flight is too short.
     """
     pixels = trajectory.pixels
     if painter is None or pixels is None or len(pixels) <= SEEN_FRAMES * STRIDE:
@@ -179,7 +179,7 @@ def record_dream(
     seen = STRIDE * (SEEN_FRAMES - 1) + 1
     reconstructed = dream(learner, trajectory, painter, parts)
     imagined = dream(learner, trajectory, painter, parts, seen)
-    imagined[:, :seen] = reconstructed[:, :seen]  # rather than another sample of the same latents
+    imagined[:, :seen] = reconstructed[:, :seen]  # the same sample of the latents in both
     return Dream(
         real=torch.stack([pixels[part] for part in parts])[:, ::STRIDE].numpy(),
         reconstructed=reconstructed[:, ::STRIDE].numpy(),

@@ -1,4 +1,4 @@
-"""Fly a policy for a number of whole episodes and measure how well it races.
+"""Evaluation of a policy over a number of whole episodes.
 
 Shapes: N environments, K steps of an episode, A action (4).
 """
@@ -25,24 +25,24 @@ from dreamer_racing.learners.learner import ValueFunction
 
 @dataclass(frozen=True)
 class Episode:
-    """What one whole episode came to.
+    """Statistics of one whole episode.
 
     Args:
-        reward_sum: undiscounted return, at the environment's present b₂.
+        reward_sum: undiscounted return, at the environment's current b₂.
         length: control steps.
         duration: s.
         gates_passed: number of gates.
         outcome: ``finished``, ``timeout`` or one of ``CRASHES``.
-        lap_times: of each complete lap, s; the first one starts at rest.
-        gate_offsets: at each pass, distance from the gate's centre, m.
+        lap_times: time of each complete lap, s; the first one starts at rest.
+        gate_offsets: distance from the gate's centre at each pass, m.
         speed_max: m/s.
         speed_mean: m/s.
         action_change_mean: mean norm of the change of the action from one control step to the next, in units of the
-            action, whose four numbers lie in [−1, 1]; 0 of an episode of one step.
-        saturation_share: share of time in which a motor was to be at one of its limits.
-        thrust_shortfall: share of the collective thrust asked for that motors were not to give, by their limits or
-            because the mixer gave it up for rates.
-        crash_gate: index of the gate that was next when the drone crashed, from 0; None if it did not.
+            action, whose four entries lie in [−1, 1]; 0 for an episode of one step.
+        saturation_share: share of time in which a motor command was at a limit.
+        thrust_shortfall: share of the commanded collective thrust that the motor commands lack, because of motor limits
+            or because the mixer gives priority to body rates.
+        crash_gate: index of the next gate when the drone crashed, from 0; None without a crash.
     """
 
     reward_sum: float
@@ -62,12 +62,12 @@ class Episode:
 
 @dataclass(frozen=True)
 class Evaluation:
-    """The episodes of an evaluation, and statistics of them.
+    """Episodes of an evaluation and their statistics.
 
     Args:
-        episodes: every episode, in the order in which they were assigned to the environments.
-        num_gates: race gates of the track.
-        trajectories: the recorded ones.
+        episodes: all episodes, in the order in which they were assigned to the environments.
+        num_gates: number of race gates of the track.
+        trajectories: the recorded episodes.
     """
 
     episodes: list[Episode]
@@ -86,12 +86,12 @@ class Evaluation:
 
     @property
     def crashes(self) -> dict[str, int]:
-        """Number of episodes that ended by each cause of a crash, zeros included."""
+        """Number of episodes that ended by each crash cause, zeros included."""
         return {cause: sum(episode.outcome == cause for episode in self.episodes) for cause in CRASHES}
 
     @property
     def crashes_by_gate(self) -> dict[str, list[int]]:
-        """For each cause of a crash, the number of episodes that ended by it on the way to each of the gates."""
+        """Number of crashes by cause and by the index of the next gate."""
         return {
             cause: [
                 sum(episode.outcome == cause and episode.crash_gate == gate for episode in self.episodes)
@@ -112,7 +112,7 @@ class Evaluation:
 
     @property
     def return_std(self) -> float:
-        """Standard deviation of the return over these episodes (0 of a single one)."""
+        """Standard deviation of the return over these episodes (0 for a single one)."""
         mean = self.return_mean
         return _mean([(episode.reward_sum - mean) ** 2 for episode in self.episodes]) ** 0.5
 
@@ -123,7 +123,7 @@ class Evaluation:
 
     @property
     def lap_times(self) -> list[float]:
-        """Times of all complete laps, also of episodes that ended in a crash later, s."""
+        """Times of all complete laps, including those of episodes that crashed later, s."""
         return [time for episode in self.episodes for time in episode.lap_times]
 
     @property
@@ -155,28 +155,28 @@ class Evaluation:
 
     @property
     def action_change_mean(self) -> float:
-        """Mean norm of the change of the action over all pairs of successive control steps: 0 is smoothest.
+        """Mean norm of the action's change over all pairs of successive control steps of an episode; 0 is smoothest.
 
-        The pairs are those of one episode; actions are taken as the drone takes them, clipped to [−1, 1].
+        Actions are clipped to [−1, 1], as in the environment.
         """
         changes = sum(episode.action_change_mean * (episode.length - 1) for episode in self.episodes)
         return changes / max(1, sum(episode.length - 1 for episode in self.episodes))
 
     @property
     def saturation_share(self) -> float:
-        """Share of all time in which a motor was to be at one of its limits."""
+        """Share of time in which a motor command was at a limit, over all episodes."""
         flown = sum(episode.saturation_share * episode.length for episode in self.episodes)
         return flown / sum(episode.length for episode in self.episodes)
 
     @property
     def thrust_shortfall(self) -> float:
-        """Mean share of the collective thrust asked for that motors were not to give, by episodes' lengths."""
+        """Mean thrust shortfall of the episodes, weighted by their lengths; see `Episode`."""
         missed = sum(episode.thrust_shortfall * episode.length for episode in self.episodes)
         return missed / sum(episode.length for episode in self.episodes)
 
     @classmethod
     def join(cls, parts: Sequence[Evaluation]) -> Evaluation:
-        """Put evaluations on tracks with the same number of gates together, in order."""
+        """Concatenate evaluations on tracks with the same number of gates, in order."""
         return cls(
             [episode for part in parts for episode in part.episodes],
             parts[0].num_gates,
@@ -184,7 +184,7 @@ class Evaluation:
         )
 
     def to_dict(self) -> dict[str, Any]:
-        """Return all statistics and, under ``episodes``, every episode; nothing but what JSON knows."""
+        """Return all statistics and, under ``episodes``, every episode, as JSON values."""
         names = (
             "success_rate",
             "gates_per_episode",
@@ -211,7 +211,7 @@ class Evaluation:
         return json.dumps(self.to_dict(), indent=2, allow_nan=False) + "\n"
 
     def summary(self) -> str:
-        """Return a small table for a person."""
+        """Return a human-readable table."""
         crashes = ", ".join(f"{count} {name.replace('_', ' ')}" for name, count in self.crashes.items() if count)
         finished = sum(episode.outcome == FINISHED for episode in self.episodes)
         timeouts = sum(episode.outcome == TIMEOUT for episode in self.episodes)
@@ -248,29 +248,29 @@ def evaluate(
     on_episode: Callable[[int, int], None] | None = None,
     on_step: Callable[[TensorDictBase], None] | None = None,
 ) -> Evaluation:
-    """Fly exactly this many whole episodes.
+    """Evaluate a policy over exactly ``episodes`` whole episodes.
 
-    Episodes are assigned to the environments beforehand (number k to environment k mod N), so that how long an episode
-    lasts has no influence on whether it counts. Only recorded images are kept.
+    Episodes are assigned to the environments beforehand (number k to environment k mod N), so that the length of an
+    episode does not affect whether it counts. Images are kept only in recordings.
 
     Args:
-        env: a `DroneRacingEnv` with ``evaluation=True``, batch size [N], or a `TransformedEnv` of one with whatever
-            the policy needs (`InitTracker`, `TensorDictPrimer`). It is reset first, and left in the middle of episodes.
-        policy: writes ``action``; put it into the mode wanted (for instance ``DreamerPolicy.deterministic``).
-        episodes: how many.
+        env: a `DroneRacingEnv` with ``evaluation=True``, batch size [N], or a `TransformedEnv` of one (`InitTracker`,
+            `TensorDictPrimer`) as the policy needs. It is reset first, and left in the middle of episodes.
+        policy: function that writes ``action``; set its mode beforehand (for instance ``DreamerPolicy.deterministic``).
+        episodes: number of episodes.
         exploration_type: what TorchRL's probabilistic policies return: mode or sample.
-        num_trajectories: the first episode of this many environments is recorded.
-        max_recorded_steps: a recording stops here, K at most; None: at the end of the episode.
-        record_pixels: whether recordings keep images, 12 KB a step.
-        value_function: of each recorded state, after the policy has acted on it; None: recordings have no values.
-        on_episode: is told after each step in which one ended how many have, and of how many.
-        on_step: is shown before each step what the policy is about to see, as `RaceWindow.show`.
+        num_trajectories: number of environments whose first episode is recorded.
+        max_recorded_steps: maximum length of a recording, K; None: the whole episode.
+        record_pixels: whether to record observations (``pixels``, ``imu``, ``vector``); images take 12 KB a step.
+        value_function: computes a value for each recorded step; None: recordings have no values.
+        on_episode: called with the numbers of finished and of all episodes, after each step in which one finished.
+        on_step: called before each step with the policy's observation, see `RaceWindow.show`.
 
     Returns:
         The episodes and the recordings.
 
     Raises:
-        ValueError: the environment is no evaluation environment or lacks what is measured, or no episode is asked for.
+        ValueError: ``env`` is no evaluation environment or lacks entries to measure, or ``episodes`` is below 1.
 
     Example:
         >>> from tensordict.nn import TensorDictModule
@@ -316,12 +316,12 @@ def evaluate(
 
 
 def split_episodes(episodes: int, worlds: int) -> list[int]:
-    """Return the number of episodes of each world, which differ by one at most, fixed before any is flown."""
+    """Return the number of episodes for each of the worlds, which differ by one at most."""
     return [episodes // worlds + (index < episodes % worlds) for index in range(worlds)]
 
 
 def _check(env: EnvBase, episodes: int) -> float:
-    """Refuse what cannot be evaluated; return the duration of a control step, s."""
+    """Check the arguments of `evaluate`; return the duration of a control step, s."""
     if episodes < 1:
         raise ValueError(f"episodes={episodes}: at least one episode is needed.")
     if len(env.batch_size) != 1:
@@ -339,17 +339,17 @@ def _check(env: EnvBase, episodes: int) -> float:
 
 
 def _as_flown(action: Tensor) -> Tensor:
-    """Return actions (N, A) as the drones take them; one that is not finite ends its episode and counts as zero."""
+    """Return actions (N, A) as the environment applies them: clipped, and zero for non-finite entries."""
     return action.float().nan_to_num(0.0, 0.0, 0.0).clamp(-1.0, 1.0)
 
 
 def _read_step(after: TensorDictBase, action_change: Tensor, effort: Tensor) -> list[dict[str, float]]:
-    """Read what is measured in one step; one dictionary for each of the N environments, in one transfer.
+    """Return the measurements of one step, one dictionary per environment, with a single device transfer.
 
     Args:
-        after: what the step led to.
-        action_change: norm of the change from the action before, (N, 1).
-        effort: of the motors, (N, 3), as `RaceWorlds.effort`.
+        after: the tensordict under ``next``.
+        action_change: norm of the change from the previous action, (N, 1).
+        effort: motor effort, (N, 3), see `RaceWorlds.effort`.
     """
     columns = {
         "action_change": action_change,
@@ -365,7 +365,7 @@ def _read_step(after: TensorDictBase, action_change: Tensor, effort: Tensor) -> 
 
 
 def _outcome(step: dict[str, float]) -> str | None:
-    """Name how the episode ended in this step; None if it goes on."""
+    """Return the outcome if the episode ended in this step, else None."""
     if not step["done"]:
         return None
     if step["crash"]:
@@ -377,28 +377,28 @@ _KEPT = (
     "reward", "speed", "gates_passed", "gate_offset", "lap_time", "action_change", "saturated", "thrust_asked",
     "thrust_missing",
 )  # fmt: skip
-"""What an episode is made of."""
+"""Measurements that are collected over an episode."""
 
 
 class _EpisodeLog:
-    """Adds up one environment's steps to episodes."""
+    """Collects the steps of one environment into episodes."""
 
     def __init__(self, control_dt: float) -> None:
         self._control_dt = control_dt
         self._values: dict[str, list[float]] = defaultdict(list)
 
     def add(self, step: dict[str, float]) -> list[Episode]:
-        """Add one step; return the episode that it ended, if it did."""
+        """Add one step; return a list with the episode if it ended in this step, else an empty list."""
         for name in _KEPT:
             self._values[name].append(step[name])
         outcome = _outcome(step)
         if outcome is None:
             return []
         values, self._values = self._values, defaultdict(list)
-        speeds = [speed for speed in values["speed"] if speed < float("inf")] or [0.0]  # a lost state has no speed
+        speeds = [speed for speed in values["speed"] if speed < float("inf")] or [0.0]  # a diverged state has no speed
         length = len(values["reward"])
         passed = values["gates_passed"]
-        changes = values["action_change"][1:]  # the first is from another episode's last action
+        changes = values["action_change"][1:]  # the first is relative to the previous episode
         episode = Episode(
             reward_sum=sum(values["reward"]),
             length=length,

@@ -1,4 +1,4 @@
-"""How good the world model is where it was not trained, and whether its dreams pay what the world pays.
+"""Metrics of a world model on held-out records, and of imagined returns against real ones.
 
 Shapes: W windows of T records, C context records, H horizon, F features.
 """
@@ -18,16 +18,16 @@ from dreamer_racing.losses import imagine
 from dreamer_racing.modules.rssm import join_features
 
 SEEN = 16
-"""Records that the model sees before it has to predict."""
+"""Context records that the model observes before it predicts."""
 
 
 @torch.no_grad()
 def world_model_metrics(learner: WorldModelLearner, batch: TensorDictBase) -> dict[str, Tensor]:
-    """Measure the world model on records as an update would, and change nothing: neither networks nor random state.
+    """Compute the world-model loss and metrics of a batch without changing networks or random state.
 
     Args:
-        learner: Whose world model is measured.
-        batch: Records ``[W, T]`` as ``WorldModelLearner.update`` takes them.
+        learner: The learner with the world model.
+        batch: Records ``[W, T]`` in the format of ``WorldModelLearner.update``.
 
     Returns:
         Losses and metrics of the world-model loss, scalars on the learner's device.
@@ -39,13 +39,13 @@ def world_model_metrics(learner: WorldModelLearner, batch: TensorDictBase) -> di
 
 @torch.no_grad()
 def held_out_metrics(learner: WorldModelLearner, batch: TensorDictBase) -> dict[str, Tensor]:
-    """Measure world model and imagination on records that were never trained on.
+    """Measure the world model and imagination on held-out records.
 
-    The random state is left as it was, so that measuring does not change a run.
+    The random state is restored, so that measuring does not change a run.
 
     Args:
-        learner: Whose networks are measured; they are not changed.
-        batch: Records ``[W, T]`` as ``WorldModelLearner.update`` takes them, T ≥ ``SEEN`` + horizon.
+        learner: The learner; its networks are not changed.
+        batch: Records ``[W, T]`` in the format of ``WorldModelLearner.update``, T ≥ ``SEEN`` + horizon.
 
     Returns:
         Scalars on the learner's device.
@@ -54,16 +54,16 @@ def held_out_metrics(learner: WorldModelLearner, batch: TensorDictBase) -> dict[
             ``held_out/reward_error``;
         - ``held_out/open_loop_reward_error``: mean absolute error of the reward sum over the horizon, predicted from
             the context and the actions taken;
-        - ``held_out/open_loop_correlation``: of those sums with the real ones;
-        - ``imagination/return_correlation`` and ``imagination/return_bias`` (imagined minus real): the return over the
-            horizon plus the discounted value after it, imagined by the present policy, against the one that the world
-            paid. The actions of newest records are those of nearly the same policy. Windows that begin at an episode's
-            last record, or in which time ran out, are left out. Not measured where updates do not imagine.
+        - ``held_out/open_loop_correlation``: correlation of those sums with the real ones;
+        - ``imagination/return_correlation`` and ``imagination/return_bias`` (imagined minus real): imagined returns of
+            the current policy against real ones, both over the horizon plus the discounted value after it. Use the
+            newest records, whose policy is nearly the current one. Windows that begin at an episode's last record or
+            contain a timeout are left out. Missing for learners without imagination.
 
     Raises:
         ValueError: If the windows are too short.
     """
-    horizon = learner.config.imagination_horizon  # the same over a run, whatever is scheduled
+    horizon = learner.config.imagination_horizon  # constant over a run, even if the horizon is scheduled
     if batch.shape[1] < SEEN + horizon:
         raise ValueError(f"Windows of {batch.shape[1]} records: {SEEN} + horizon {horizon} are needed.")
     with _untouched(learner):
@@ -72,7 +72,7 @@ def held_out_metrics(learner: WorldModelLearner, batch: TensorDictBase) -> dict[
 
 @contextmanager
 def _untouched(learner: WorldModelLearner) -> Iterator[None]:
-    """Run the learner's networks as updates do, and leave the random state as it was."""
+    """Return a context with the autocast of updates that restores the random state on exit."""
     devices = [learner.device] if learner.device.type == "cuda" else []
     with torch.random.fork_rng(devices=devices), learner.autocast():
         yield
@@ -83,7 +83,7 @@ def _measure(learner: WorldModelLearner, batch: TensorDictBase, horizon: int) ->
     losses, (belief, state) = learner.world_model_loss(batch)  # (W, T, ·)
     metrics = {f"held_out/{name}": value for name, value in losses.items()}
     start = (belief[:, SEEN - 1], state[:, SEEN - 1])
-    alive = (~batch["is_init"].squeeze(-1)[:, SEEN:]).cumprod(1).float()  # (W, H) of the start's episode
+    alive = (~batch["is_init"].squeeze(-1)[:, SEEN:]).cumprod(1).float()  # (W, H) same episode as the start
     alive = alive * (1 - batch["terminated"].squeeze(-1)[:, SEEN - 1 : SEEN].float())
     reward = batch["reward"].squeeze(-1)[:, SEEN:] * alive
 
@@ -111,16 +111,16 @@ def _measure(learner: WorldModelLearner, batch: TensorDictBase, horizon: int) ->
 
 
 def _comparable(batch: TensorDictBase, alive: Tensor, goes_on_at_first: Tensor) -> Tensor:
-    """Which windows ``(W,)`` an imagined return can be held against: not begun or cut off where an episode ended.
+    """Return which windows ``(W,)`` are comparable: not begun at an episode's last record, and without a timeout.
 
-    A crash inside the horizon stays; a time limit there hides what the world would have paid.
+    A crash inside the horizon is comparable; a timeout is not, because the real return after it is unknown.
     """
     cut_off = (batch["truncated"].squeeze(-1)[:, SEEN:] & alive.bool()).any(1)
     return goes_on_at_first & ~cut_off
 
 
 def _imagined_return(learner: DreamerV3, start: tuple[Tensor, Tensor], horizon: int, discount: Tensor) -> Tensor:
-    """Let the policy act in the model; return discounted rewards plus the value after them, ``(W,)``."""
+    """Imagine with the policy; return the discounted rewards plus the value after the horizon, ``(W,)``."""
     model = learner.agent.world_model
     features = imagine(model.rssm, learner.agent.actor, *start, horizon).features[1:]  # (H, W, F)
     continuation = model.continue_head.probability(features).squeeze(-1)  # (H, W)
@@ -133,6 +133,6 @@ def _imagined_return(learner: DreamerV3, start: tuple[Tensor, Tensor], horizon: 
 
 
 def correlation(first: Tensor, second: Tensor) -> Tensor:
-    """Return the correlation of two vectors ``(W,)``, a scalar; 0 where one does not vary."""
+    """Return the correlation of two vectors ``(W,)``, a scalar; 0 if one is constant."""
     first, second = first - first.mean(), second - second.mean()
     return (first * second).sum() / (first.norm() * second.norm()).clamp_min(1e-8)

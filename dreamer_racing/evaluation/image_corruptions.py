@@ -1,4 +1,4 @@
-"""Image corruptions: a policy that flies by sight must fail when its images are frozen, blank or noise.
+"""Image corruptions: a policy that relies on vision must fail when its images are frozen, blank or noise.
 
 Shapes: N environments, H × W pixels.
 """
@@ -16,11 +16,11 @@ from dreamer_racing.learners.learner import Policy
 
 GREY = 128
 Corruption = Callable[[Tensor, Tensor], Tensor]
-"""Maps images (N, H, W, 3) uint8, and where an episode begins, (N,) bool, to the images that the policy sees."""
+"""Maps images (N, H, W, 3) uint8 and ``is_init`` (N,) bool to the images that the policy sees."""
 
 
 def intact(pixels: Tensor, is_init: Tensor) -> Tensor:
-    """Return the images as they are: what corruptions are compared with."""
+    """Return the images unchanged, as the baseline."""
     return pixels
 
 
@@ -30,20 +30,20 @@ def blank(pixels: Tensor, is_init: Tensor) -> Tensor:
 
 
 class Frozen:
-    """Shows the first image of an episode until its end."""
+    """Repeats the first image of each episode until the episode ends."""
 
     def __init__(self) -> None:
         self._first: Tensor | None = None  # (N, H, W, 3)
 
     def __call__(self, pixels: Tensor, is_init: Tensor) -> Tensor:
-        """Return the first images; where an episode begins, these."""
+        """Return the first image of each episode."""
         begins = is_init.view(-1, 1, 1, 1)
         self._first = pixels.clone() if self._first is None else torch.where(begins, pixels, self._first)
         return self._first
 
 
 class Noise:
-    """Shows uniform noise, drawn anew for every pixel, colour and step from a generator of the seed."""
+    """Replaces images by uniform noise, independent for every pixel, colour channel and step."""
 
     def __init__(self, seed: int = 0) -> None:
         self._generator = torch.Generator().manual_seed(seed)
@@ -60,15 +60,15 @@ CORRUPTIONS: dict[str, Callable[[], Corruption]] = {
     "blank": lambda: blank,
     "noise": Noise,
 }
-"""Makers of corruptions by name; one is made for every flight, for it may remember images."""
+"""Factories of corruptions by name. Make a new corruption for every evaluation, because it may store images."""
 
 
 class CorruptedPolicy(torch.nn.Module):
-    """A policy that sees corrupted images; nothing but the policy sees them.
+    """A policy that acts on corrupted images; the tensordict keeps the original ones.
 
     Args:
-        policy: that reads ``pixels``.
-        corruption: what happens to them.
+        policy: a policy that reads ``pixels``.
+        corruption: the corruption of the images.
 
     Example:
         >>> # result = fly(CorruptedPolicy(policy, blank), {"track": "circle"}, episodes=10)
@@ -81,7 +81,7 @@ class CorruptedPolicy(torch.nn.Module):
 
     @property
     def deterministic(self) -> bool:
-        """Whether the policy takes modes instead of samples."""
+        """Whether the policy acts without sampling."""
         return self.policy.deterministic
 
     @deterministic.setter
@@ -89,7 +89,7 @@ class CorruptedPolicy(torch.nn.Module):
         self.policy.deterministic = deterministic
 
     def make_primer(self) -> Transform:
-        """Make the policy's own."""
+        """Return the primer of the policy."""
         return self.policy.make_primer()
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:

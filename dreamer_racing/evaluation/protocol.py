@@ -1,6 +1,6 @@
-"""The evaluation protocol: under which conditions a policy is flown, and the table of what came of it.
+"""The evaluation protocol: the conditions under which a policy is evaluated, and the table of results.
 
-docs/evaluation.md says what is measured and why. Shapes: N environments.
+See docs/evaluation.md for the metrics and their reasons. Shapes: N environments.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from dreamer_racing.evaluation.evaluate import Evaluation, split_episodes
 from dreamer_racing.learners.learner import Policy
 
 EPISODES = 100
-"""The fewest episodes of each condition that the protocol asks for."""
+"""Minimum number of episodes per condition."""
 
 PRESETS = ("easy", "faithful")
 MODES = ("deterministic", "stochastic")
@@ -25,16 +25,16 @@ MODES = ("deterministic", "stochastic")
 
 @dataclass(frozen=True)
 class Condition:
-    """One way in which a race differs from the one that the agent was trained on.
+    """A condition: one way in which the evaluated race differs from the training race.
 
     Args:
-        name: in files.
-        meaning: in words.
-        start_noise: of the start pose, as a multiple of the noise of training starts.
-        camera_tilt: half-width of the uniform draw that is added to the camera's tilt in every episode, degrees.
+        name: used in file names.
+        meaning: a description.
+        start_noise: noise of the start pose, as a multiple of the noise of training starts.
+        camera_tilt: half-width of the uniform noise added to the camera's tilt in every episode, degrees.
         gate_shift: radius of the ball in which every gate is displaced, m.
-        gate_turn: half-width of the uniform draw of every gate's turn, degrees.
-        num_tracks: how many displaced tracks there are; episodes are split evenly among them.
+        gate_turn: half-width of the uniform rotation of every gate, degrees.
+        num_tracks: number of displaced tracks; episodes are split evenly among them.
     """
 
     name: str
@@ -47,14 +47,14 @@ class Condition:
 
     @property
     def needs_images(self) -> bool:
-        """Whether nothing changes for an agent without a camera."""
+        """Whether the condition affects only agents with a camera."""
         return self.camera_tilt > 0.0
 
     def races(self, track: Track, seed: int) -> Iterator[dict[str, Any]]:
-        """Yield the arguments of `DroneRacingEnv` of each of the condition's tracks.
+        """Yield the arguments of `DroneRacingEnv` for each of the condition's tracks.
 
         Raises:
-            TrackError: the gates cannot be displaced like that.
+            TrackError: the gates cannot be displaced that far.
         """
         looks = None
         if self.camera_tilt:
@@ -82,26 +82,26 @@ CONDITIONS = (
         num_tracks=10,
     ),
 )
-"""The conditions of the protocol; their numbers are this project's choice [choice]."""
+"""The conditions of the protocol, with numbers chosen by this project [choice]."""
 
 
 @dataclass(frozen=True)
 class Result:
-    """What came of one condition, with one preset of physics and one mode of the policy."""
+    """Result of one condition with one physics preset and one mode of the policy."""
 
     preset: str
     condition: str
     mode: str
-    track: Track  # of the recorded flight; the others may be displaced otherwise
+    track: Track  # of the recorded flight; other flights may be on differently displaced tracks
     evaluation: Evaluation
 
     @property
     def name(self) -> str:
-        """For files."""
+        """Name for files."""
         return f"{self.preset}_{self.condition}_{self.mode}"
 
     def to_dict(self) -> dict[str, Any]:
-        """Return the statistics without the episodes; nothing but what JSON knows."""
+        """Return the statistics without the episodes, as JSON values."""
         statistics = self.evaluation.to_dict()
         del statistics["episodes"]
         return {"preset": self.preset, "condition": self.condition, "policy": self.mode, **statistics}
@@ -117,19 +117,19 @@ def run_protocol(
     num_envs: int | None = None,
     seed: int = 0,
 ) -> Iterator[Result]:
-    """Fly a policy under all conditions, with each preset, in both modes, and yield what came of each.
+    """Evaluate a policy under all conditions, with each preset, in both modes, and yield the results.
 
-    Conditions that only a camera feels are left out for an agent without images.
+    Conditions that affect only the camera are skipped for an agent without images.
 
     Args:
-        policy: what is flown.
+        policy: the policy.
         worlds: arguments of `DroneRacingEnv`: ``track``, ``camera``, ``renderer``, ``from_pixels``.
-        episodes: of each condition.
-        conditions: which.
-        presets: of physics.
-        num_envs: as of `Course`.
-        seed: of starts, displaced gates, physics and looks: the same races for both modes, and for every policy, as far
-            as `Course` says.
+        episodes: number of episodes per condition.
+        conditions: the conditions.
+        presets: physics presets.
+        num_envs: see `Course`.
+        seed: seed of starts, displaced gates, physics and looks. Both modes and all policies get the same races, within
+            the limits that `Course` describes.
     """
     track = load_track(worlds["track"])
     for preset in presets:
@@ -155,10 +155,10 @@ def run_protocol(
 
 
 def check_conditions(conditions: Sequence[Condition], track: Track, seed: int) -> None:
-    """Refuse conditions that a track leaves no room for, before any is flown.
+    """Check that the track leaves room for all conditions, before any is evaluated.
 
     Raises:
-        ValueError: the message names the condition.
+        ValueError: it does not; the message names the condition.
     """
     for condition in conditions:
         try:
@@ -176,14 +176,14 @@ def fly(
     num_envs: int | None = None,
     **recording: Any,
 ) -> Evaluation:
-    """Make races, fly a policy in them, and free them.
+    """Create environments, evaluate a policy in them, and close them.
 
     Args:
-        policy: what is flown, on whichever device it is.
+        policy: the policy, on any device.
         worlds: arguments of `DroneRacingEnv`.
-        episodes: how many.
+        episodes: number of episodes.
         deterministic: the mode of the policy.
-        num_envs: as of `Course`.
+        num_envs: see `Course`.
         recording: arguments of `evaluate`: ``num_trajectories``, ``max_recorded_steps``, ``record_pixels``.
     """
     course = Course(policy, worlds, episodes, num_envs)
@@ -194,11 +194,11 @@ def fly(
 
 
 def results_table(results: Sequence[Result], condition: str = "condition") -> str:
-    """Write results as a Markdown table, one row each.
+    """Return a Markdown table with one row per result.
 
     Args:
-        results: what came of the conditions.
-        condition: what a condition is called at the table's head.
+        results: the results.
+        condition: head of the column of conditions.
     """
     head = (
         "physics", condition, "policy", "success", "gates", "best lap (s)", "mean lap (s)", "top speed (m/s)",
@@ -227,7 +227,7 @@ def results_table(results: Sequence[Result], condition: str = "condition") -> st
 
 
 def crashes_in_words(evaluation: Evaluation) -> str:
-    """Name how many episodes crashed, by which cause and on the way to which gate, counted from 1."""
+    """Return the number of crashes as text, by cause and by the next gate, counted from 1."""
     words = []
     for cause, counts in evaluation.crashes_by_gate.items():
         places = [f"{count} at gate {gate}" for gate, count in enumerate(counts, start=1) if count]

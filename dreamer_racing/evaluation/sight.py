@@ -1,8 +1,8 @@
-"""What the nose camera looks at: how far its axis points away from gates and decoys, and which of them it sees.
+"""Statistics of what the nose camera sees: angles between its axis and gates or decoys, and which of them are in view.
 
-A gate is taken for its centre, and a decoy likewise. It is in view while that point projects into the image; what may
-stand before it (another gate's frame, nothing else) is ignored, and so is the side from which a gate is seen, for both
-look the same. Reference: paper, Fig. "Ablation study on the perception aware behaviour".
+A gate or decoy is in view while its centre projects into the image. Occlusion (only another gate's frame can occlude)
+is ignored, and so is the side from which a gate is seen, because both sides look the same.
+Reference: paper, Fig. "Ablation study on the perception aware behaviour".
 
 Shapes: K control steps of an episode, L points, M observations, G race gates.
 """
@@ -29,34 +29,34 @@ BIN_DEGREES = 5
 
 @dataclass(frozen=True)
 class Sight:
-    """How one thing stood to the camera in each of M observations."""
+    """Angle and visibility of one gate or decoy in each of M observations."""
 
     angle: Tensor
-    """(M,) between the camera's axis and the direction from the camera to the thing, degrees; NaN where it is none."""
+    """(M,) angle between the camera's axis and the direction to the object, degrees; NaN where there is no object."""
     in_view: Tensor
-    """(M,) bool: its centre was in the image."""
+    """(M,) bool: the object's centre was in the image."""
     flight: Tensor
-    """(M,) int64: in which flight; observations of one flight are no independent samples."""
+    """(M,) int64: index of the flight; observations of the same flight are not independent samples."""
 
     @property
     def share_in_view(self) -> float:
-        """Share of observations, and so of time, in which it was in view."""
+        """Share of observations, and so of time, with the object in view."""
         return float(self.in_view.float().mean())
 
     @property
     def shares_by_flight(self) -> list[float]:
-        """Share of each flight's observations in which it was in view."""
+        """Share of each flight's observations with the object in view."""
         return [float(self.in_view[self.flight == index].float().mean()) for index in self.flight.unique()]
 
     def histogram(self) -> Tensor:
-        """Return the share of its observations in each bin of 5° from 0° to 180°, (36,)."""
+        """Return the share of angles in each bin of 5° from 0° to 180°, (36,)."""
         angles = self.angle[self.angle.isfinite()]
         bins = 180 // BIN_DEGREES
         counts = torch.bincount((angles / BIN_DEGREES).long().clamp(0, bins - 1), minlength=bins)
         return counts / max(1, len(angles))
 
     def to_dict(self) -> dict[str, Any]:
-        """Return share, mean, quantiles and histogram of the angle; nothing but what JSON knows."""
+        """Return the share in view, and mean, quantiles and histogram of the angle, as JSON values."""
         angles = self.angle[self.angle.isfinite()].double()
         levels = torch.tensor(QUANTILES, dtype=torch.float64) / 100
         quantiles = angles.quantile(levels).tolist() if len(angles) else [None] * len(QUANTILES)
@@ -72,19 +72,19 @@ class Sight:
 def measure_sight(
     trajectories: Sequence[Trajectory], track: Track, camera: Camera, decoys: Sequence[Gate] = ()
 ) -> dict[str, Sight]:
-    """Measure what the camera was turned to, over all observations of some flights.
+    """Measure which gates and decoys the camera was pointed at, over all observations of some flights.
 
     Args:
         trajectories: the flights.
-        track: whose race gates were flown through.
+        track: the track with the race gates.
         camera: the nose camera.
-        decoys: where decoys stand, or would stand if there were any.
+        decoys: poses of the decoys, or poses at which decoys could stand.
 
     Returns:
-        ``next gate``: the one to pass next. ``nearest visible gate``: of the race gates in view the one nearest to the
-        camera; its angle is NaN while none is in view. ``gate 1``, ``gate 2`` and so on: each race gate, whether it is
-        the next one or not. ``decoy 1``, ``decoy 2`` and so on; ``any decoy``: in view if one of them is; its angle is
-        that to the one nearest to the camera's axis.
+        One `Sight` per object. ``next gate``: the gate to pass next. ``nearest visible gate``: the race gate in view
+        that is nearest to the camera; its angle is NaN while none is in view. ``gate 1``, ``gate 2`` and so on: each
+        race gate. ``decoy 1``, ``decoy 2`` and so on: each decoy. ``any decoy``: in view if any decoy is; its angle is
+        the smallest of the decoys' angles.
     """
     position, attitude, target_gate = (
         torch.cat([getattr(trajectory, name) for trajectory in trajectories])
@@ -117,26 +117,26 @@ def measure_sight(
 
 
 def _one_by_one(kind: str, angle: Tensor, in_view: Tensor, flight: Tensor) -> dict[str, Sight]:
-    """Return the sights of things of a kind, each of a column of (M, L), by name and number."""
+    """Return one `Sight` per column of (M, L), named by kind and number."""
     columns = enumerate(zip(angle.unbind(-1), in_view.unbind(-1), strict=True), start=1)
     return {f"{kind} {number}": Sight(*column, flight) for number, column in columns}
 
 
 def is_race_gate(thing: str) -> bool:
-    """Whether a sight is of one race gate by its number; there may be many of them."""
+    """Return whether a name in the result of `measure_sight` is that of a numbered race gate."""
     return thing.startswith("gate ")
 
 
 def angles(points: Tensor) -> Tensor:
-    """Return the angles between the camera's axis and points (..., 3) in its axes, (...), degrees."""
+    """Return the angles between the camera's axis and points (..., 3) in the camera's frame, (...), degrees."""
     return torch.rad2deg(torch.atan2(points[..., 1:].norm(dim=-1), points[..., 0]))
 
 
 def sight_table(flights: Mapping[str, Mapping[str, Sight]]) -> str:
-    """Write what the camera was turned to as a Markdown table, but for single race gates, which `gate_table` has.
+    """Return a Markdown table of shares in view and angles, without the numbered race gates (see `gate_table`).
 
     Args:
-        flights: the sights of each kind of flight, by name.
+        flights: results of `measure_sight`, by the name of the kind of flight.
     """
     head = ("flights", "looked at", "in view", "angle: mean", *(f"{level} %" for level in QUANTILES))
     rows = [head, ("---",) * len(head)]
@@ -152,10 +152,10 @@ def sight_table(flights: Mapping[str, Mapping[str, Sight]]) -> str:
 
 
 def gate_table(flights: Mapping[str, Mapping[str, Sight]]) -> str:
-    """Write the share of time in which each race gate was in view as a Markdown table, a row for each gate.
+    """Return a Markdown table of the share of time that each race gate was in view, one row per gate.
 
     Args:
-        flights: the sights of each kind of flight, by name, on tracks of the same race gates.
+        flights: results of `measure_sight` on tracks with the same race gates, by the name of the kind of flight.
     """
     gates = dict.fromkeys(name for sights in flights.values() for name in sights if is_race_gate(name))
     head = ("in view", *flights)

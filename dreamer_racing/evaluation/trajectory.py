@@ -1,4 +1,4 @@
-"""One recorded flight, and the recorder that makes it.
+"""Recorded flights: the trajectory, its recorder, and its files.
 
 Shapes: N environments, M of them recorded, K steps of an episode, A action (4).
 """
@@ -26,22 +26,22 @@ from dreamer_racing.envs.tracks import Track, describe_track, load_track, read_t
 
 FINISHED, TIMEOUT = "finished", "timeout"
 CRASHES = tuple(cause.name.lower() for cause in CrashCause if cause is not CrashCause.NONE)
-"""Names of the causes of a crash; an episode's outcome is one of these, ``finished`` or ``timeout``."""
+"""Names of the crash causes; an episode's outcome is one of these, ``finished`` or ``timeout``."""
 STATE = {
     "position": ("x", "y", "z"),
     "attitude": ("qw", "qx", "qy", "qz"),
     "linear_velocity": ("vx", "vy", "vz"),
     "target_gate": ("target_gate",),
 }
-"""Columns of each field, in SI units, beside the time ``t`` and the action ``a0`` …"""
+"""CSV columns of each field, in SI units; further columns are the time ``t`` and the action ``a0`` …"""
 
 HEAD = ("track", "control_dt", "outcome")
 TILT = "camera_tilt"
-"""Line above the columns, after those of `HEAD`; only in files of flights whose camera is known."""
+"""Name of an optional header line after those of `HEAD`: the camera's tilt, if known."""
 VALUE = "value"
-"""Column of what a critic expected, behind the action; only in files of flights that one judged."""
+"""Name of an optional column after the action: the critic's value, if the flight has one."""
 NUMBERS, IMAGES = "_trajectory.csv", "_onboard.npz"
-"""Ends of the names of a stored flight's two files."""
+"""File name suffixes of the numbers and images of a flight."""
 
 
 @dataclass(frozen=True)
@@ -57,29 +57,29 @@ class Trajectory:
     target_gate: Tensor
     """(K + 1,) int64: the gate to pass next."""
     action: Tensor
-    """(K, A): row k leads from k to k + 1."""
+    """(K, A): row k is the action from observation k to k + 1."""
     pixels: Tensor | None
     """(K + 1, H, W, 3) uint8, or None if the environment has no images."""
     control_dt: float
-    """Duration of a step, s."""
+    """Duration of a control step, s."""
     outcome: str | None
-    """How the episode ended; None if the recording was stopped before its end."""
+    """How the episode ended; None if the recording stopped before its end."""
     value: Tensor | None = None
-    """(K,): the return that a critic expected from row k on, discounted as in training; None if none judged."""
+    """(K,): the critic's discounted return from row k on; None without a critic."""
     camera_tilt: float | None = None
-    """Of the camera that it was flown by, upwards from the body's x axis, degrees; None without one, or unknown."""
+    """Tilt of the camera upwards from the body's x axis, degrees; None without a camera, or if unknown."""
     imu: Tensor | None = None
-    """(K + 1, 6) what the drone's IMU told beside the images; None without one, and in files."""
+    """(K + 1, 6) IMU measurements; None without an IMU, or if read from a file."""
     vector: Tensor | None = None
-    """(K + 1, V) numbers that the agent saw, likewise."""
+    """(K + 1, V) the observation ``vector``; None without one, or if read from a file."""
 
     @property
     def speed(self) -> Tensor:
-        """(K + 1,) m/s."""
+        """(K + 1,) speed, m/s."""
         return self.linear_velocity.norm(dim=-1)
 
     def part(self, first: int, last: int) -> Trajectory:
-        """Return the stretch from row ``first`` to row ``last``, both included; its end is open if it is cut off."""
+        """Return rows ``first`` to ``last``, inclusive; the outcome is None if the last row is left out."""
         rows = {name: getattr(self, name)[first : last + 1] for name in ("position", "attitude", "linear_velocity")}
         return Trajectory(
             **rows,
@@ -96,18 +96,18 @@ class Trajectory:
 
     @property
     def crashed(self) -> bool:
-        """Whether the last row is where the drone crashed."""
+        """Whether the episode ended in a crash."""
         return self.outcome in CRASHES
 
 
 class TrajectoryRecorder:
-    """Records the first episode of the first M environments, all of them with one copy per step and entry.
+    """Records the first episode of the first M environments, with one copy per step and entry for all of them.
 
     Args:
-        root: after the reset, batch size [N].
+        root: the tensordict after the reset, batch size [N].
         count: M, at most N.
-        max_steps: a recording stops here, K at most.
-        pixels: whether to keep images too, where there are any.
+        max_steps: maximum of K.
+        pixels: whether to record ``pixels``, ``imu`` and ``vector``, if present.
     """
 
     def __init__(self, root: TensorDictBase, count: int, max_steps: float, pixels: bool = True) -> None:
@@ -122,16 +122,16 @@ class TrajectoryRecorder:
 
     @property
     def running(self) -> bool:
-        """Whether there is an episode still to be recorded."""
+        """Whether an episode is still being recorded."""
         return any(self._running)
 
     def add(self, step: TensorDictBase, outcomes: Sequence[str | None], value: Tensor | None = None) -> None:
-        """Record a step, its action at the root and its observation under ``next``.
+        """Record a step: the action at the root and the observation under ``next``.
 
         Args:
-            step: batch size [N].
-            outcomes: how the episode of each of the N environments ended in this step; None if it goes on.
-            value: what a critic made of the root, (N, 1); given at every step or at none.
+            step: the tensordict of the step, batch size [N].
+            outcomes: the outcome of each environment's episode, if it ended in this step; else None.
+            value: critic's value of the root, (N, 1); pass it at every step or at none.
         """
         if not self.running:
             return
@@ -150,14 +150,14 @@ class TrajectoryRecorder:
 
         Args:
             control_dt: duration of a step, s.
-            camera_tilt: as recordings have it.
+            camera_tilt: see `Trajectory`.
         """
         rows = {name: torch.stack(values) for name, values in self._rows.items()}  # each (K [+ 1], M, ...)
         cut = []
         for index, (length, outcome) in enumerate(zip(self._lengths, self._outcomes, strict=True)):
             own: dict[str, Any] = {
                 name: values[: length + (name not in ("action", VALUE)), index].clone() for name, values in rows.items()
-            }  # clones, so that one recording does not keep all alive
+            }  # cloned, so that one recording does not keep the memory of all alive
             own = {"pixels": None, **own, "outcome": outcome}
             cut.append(Trajectory(**own, control_dt=control_dt, camera_tilt=camera_tilt))
         return cut
@@ -171,26 +171,26 @@ class TrajectoryRecorder:
                 self._rows[name].append(self._copy(seen))
 
     def _copy(self, value: Tensor) -> Tensor:
-        """(N, ...) → (M, ...) on the CPU, not changed by later steps."""
+        """Copy (N, ...) → (M, ...) to the CPU."""
         return value[: len(self._running)].to("cpu", copy=True)
 
 
 def write_trajectory(path: str | Path, trajectory: Trajectory, track: str | Path | Track) -> None:
-    """Write an episode as CSV: a row an observation, K + 1 of them, the action beside the one it was taken at.
+    """Write an episode as CSV, atomically, with one row per observation, K + 1 in all.
 
-    So is the value, where a critic judged. Images are left out; every other number is kept to the last bit. Lines with
-    `#` say what there is besides rows.
+    A row holds the observation, and the action and any critic's value at it. Numbers are exact to the last bit; images,
+    ``imu`` and ``vector`` are left out. Header lines begin with `#`.
 
     Args:
-        path: the file; missing folders are made.
+        path: the file; missing folders are created.
         trajectory: the episode.
-        track: what it was flown on, as `load_track` takes it; the file holds all of it.
+        track: the track, in a form that `load_track` accepts; the file holds its full description.
     """
     fields = [getattr(trajectory, name).reshape(len(trajectory.position), -1).tolist() for name in STATE]
     steps, names = trajectory.action, [f"a{index}" for index in range(trajectory.action.shape[1])]
     if trajectory.value is not None:
         steps, names = torch.cat((steps, trajectory.value[:, None]), dim=1), [*names, VALUE]
-    actions = [*steps.tolist(), [""] * len(names)]  # none at the last observation
+    actions = [*steps.tolist(), [""] * len(names)]  # the last observation has no action
     Path(path).parent.mkdir(parents=True, exist_ok=True)
     partial = Path(path).with_name(f".{Path(path).name}.partial")
     with partial.open("w", newline="", encoding="utf-8") as file:
@@ -208,14 +208,14 @@ def write_trajectory(path: str | Path, trajectory: Trajectory, track: str | Path
 
 
 def read_trajectory(path: str | Path) -> tuple[Trajectory, Track]:
-    """Read what `write_trajectory` wrote.
+    """Read a file written by `write_trajectory`.
 
     Returns:
         The episode, without images, and its track.
 
     Raises:
-        ValueError: this is no such file, or it was cut short.
-        TrackError: its track cannot be flown.
+        ValueError: the file is of another kind or truncated.
+        TrackError: its track is invalid.
         OSError: it cannot be read.
     """
     text = Path(path).read_text(encoding="utf-8", errors="replace")
@@ -255,7 +255,7 @@ def read_trajectory(path: str | Path) -> tuple[Trajectory, Track]:
 
 
 def _read_track(text: str, path: str | Path) -> Track:
-    """Read the track that a file holds."""
+    """Parse the track in a file's header."""
     try:
         content = json.loads(text)
     except ValueError as error:
@@ -264,18 +264,18 @@ def _read_track(text: str, path: str | Path) -> Track:
 
 
 def write_flight(stem: str | Path, trajectory: Trajectory, track: str | Path | Track) -> list[str]:
-    """Write an episode with its images: `<stem>_trajectory.csv` and, of one that has some, `<stem>_onboard.npz`.
+    """Write an episode as `<stem>_trajectory.csv` and its images, if any, as `<stem>_onboard.npz`.
 
     Args:
-        stem: folder and beginning of both files' names.
+        stem: path of both files without the suffix.
         trajectory: the episode.
-        track: what it was flown on, as `load_track` takes it.
+        track: the track, in a form that `load_track` accepts.
 
     Returns:
         The files' names.
     """
     numbers, images = _files(stem)
-    images.unlink(missing_ok=True)  # of an earlier flight: it must not be taken for this one's
+    images.unlink(missing_ok=True)  # of an earlier flight with the same name
     write_trajectory(numbers, trajectory, track)
     if trajectory.pixels is None:
         return [numbers.name]
@@ -286,17 +286,17 @@ def write_flight(stem: str | Path, trajectory: Trajectory, track: str | Path | T
 
 
 def read_flight(path: str | Path) -> tuple[Trajectory, Track]:
-    """Read what `write_flight` or `write_trajectory` wrote.
+    """Read files written by `write_flight` or `write_trajectory`.
 
     Args:
-        path: of the numbers, `*_trajectory.csv`.
+        path: path of the numbers, `*_trajectory.csv`.
 
     Returns:
-        The episode, with images if they lie beside it, and its track.
+        The episode, with the images if their file is in the same folder, and its track.
 
     Raises:
-        ValueError: a file is none of these, was cut short, or the images are not those of the flight.
-        OSError: it cannot be read.
+        ValueError: a file is of another kind or truncated, or the images belong to another flight.
+        OSError: a file cannot be read.
     """
     trajectory, track = read_trajectory(path)
     _, images = _files(Path(path).with_name(Path(path).name.removesuffix(NUMBERS)))
@@ -316,7 +316,7 @@ def read_flight(path: str | Path) -> tuple[Trajectory, Track]:
 
 
 def _files(stem: str | Path) -> tuple[Path, Path]:
-    """Where the numbers and the images of a flight are kept."""
+    """Return the paths of the numbers and the images of a flight."""
     return Path(f"{stem}{NUMBERS}"), Path(f"{stem}{IMAGES}")
 
 
@@ -326,5 +326,5 @@ def _columns(rows: list[list[str]], columns: list[int]) -> torch.Tensor:
 
 
 def _text(cell: float | int | str) -> str:
-    """Write a float32 so that it is read back exactly."""
+    """Format a float32 so that it is read back exactly."""
     return f"{cell:.9g}" if isinstance(cell, float) else str(cell)

@@ -1,1 +1,1 @@
-"""The actor as a file. Nothing is imported here: `onnx_actor` flies without torch and can be copied alone."""
+"""Export of the actor. Nothing is imported here: `onnx_actor` runs without torch and can be copied alone."""

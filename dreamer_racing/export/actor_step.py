@@ -1,14 +1,14 @@
-"""Export of the recurrent actor as one explicit step, published only if its copies fly as the original does.
+"""Export of the recurrent actor as one step with explicit state, published only if all copies match the original.
 
-`ActorStep` takes all recurrent state as inputs and gives it back as outputs: ``(observation, h, z, previous_action,
+`ActorStep` takes all recurrent state as inputs and returns it as outputs: ``(observation, h, z, previous_action,
 is_init[, imu][, noise]) -> (action, h_next, z_next)``, batch size 1. `export_actor` writes it for onnxruntime and as a
 ``torch.export`` program, and publishes both, with the contract of `contract`, only if they pass `parity`.
 
-A large step can be written in two `PARTS`, too: ``advance``, ``(h, z, previous_action, is_init) -> h_next``, which
-needs no observation, so that a vehicle can run it while a command is on its way; and ``act``, ``(observation,
-h_next[, imu][, noise]) -> (action, z_next)``, which is all that stands between seeing and acting.
+A large step can also be written in two `PARTS`: ``advance``, ``(h, z, previous_action, is_init) -> h_next``, needs no
+observation, so that a vehicle can run it between control steps; ``act``, ``(observation, h_next[, imu][, noise]) ->
+(action, z_next)``, is then the only computation between an observation and its action.
 
-Shape legend: D belief, S state = L·K, L latents, K classes, A action, V numbers.
+Shape legend: D belief, S state = L·K, L latents, K classes, A action, V vector entries.
 """
 
 from __future__ import annotations
@@ -40,18 +40,18 @@ PACKAGES = ("onnx", "onnxscript", "onnxruntime")
 OUTPUTS = ("action", "h_next", "z_next")
 WEIGHTS = "weights.safetensors"
 PROTOBUF_LIMIT = 2_000_000_000
-"""Bytes that an ONNX file may have without external data."""
+"""Maximum size in bytes of an ONNX file without external data."""
 
 
 class MissingPackagesError(ImportError):
-    """Packages that only the export needs are not installed."""
+    """Packages that the export needs are not installed."""
 
 
 class ActorStep(nn.Module):
-    """One acting step of explicit state: z is the posterior's mode, the action the mean of the actor's clipped samples.
+    """One step with explicit state: z is the posterior's mode, the action the mean of the actor's clipped samples.
 
     Args:
-        agent: Its encoder, RSSM and actor are copied.
+        agent: The agent whose encoder, RSSM and actor are copied.
 
     Attributes:
         noise_shape: Shape of the input ``noise``, or None if there is none.
@@ -74,27 +74,27 @@ class ActorStep(nn.Module):
         self.rssm = copy.deepcopy(agent.world_model.rssm)
         self.actor = copy.deepcopy(agent.actor)
         for parameter in self.parameters():
-            # torch.export saves no channels-last weights.
+            # torch.export cannot save channels-last weights.
             parameter.data = parameter.data.cpu().contiguous()
         self.requires_grad_(False)
 
     @property
     def noise_shape(self) -> tuple[int, int] | None:
-        """Shape (L, K) of the noise of one step; None if it takes none."""
+        """Shape (L, K) of the noise of one step; None without noise."""
         return None
 
     def forward(
         self, observation: Tensor, h: Tensor, z: Tensor, previous_action: Tensor, is_init: Tensor, *more: Tensor
     ) -> tuple[Tensor, Tensor, Tensor]:
-        """Step.
+        """Compute one step.
 
         Args:
             observation: uint8 ``(1, height, width, 3)``, or float32 ``(1, V)``.
-            h: Belief after the last step, ``(1, D)``; like the next two ignored where ``is_init``.
+            h: Belief after the last step, ``(1, D)``; ignored if ``is_init``, as are ``z`` and ``previous_action``.
             z: State after the last step, ``(1, S)``.
             previous_action: ``(1, A)``.
             is_init: Whether this is the first step of an episode, bool ``(1,)``.
-            more: Numbers seen beside images, float32 ``(1, V)``, where there are any; the noise, likewise.
+            more: Vector observed besides images, float32 ``(1, V)``, if any; then the noise, if any.
 
         Returns:
             Action ``(1, A)`` in [−1, 1], next belief ``(1, D)``, next state ``(1, S)``.
@@ -104,11 +104,11 @@ class ActorStep(nn.Module):
         return action, h, z
 
     def advance(self, h: Tensor, z: Tensor, previous_action: Tensor, is_init: Tensor) -> Tensor:
-        """Return the next belief ``(1, D)``, which needs no observation; arguments as in `forward`."""
+        """Return the next belief ``(1, D)``; arguments as in `forward`."""
         return self.rssm.advance(previous_action, is_init, h, z)
 
     def act(self, observation: Tensor, h: Tensor, *more: Tensor) -> tuple[Tensor, Tensor]:
-        """Return action ``(1, A)`` and next state ``(1, S)`` by what is seen and the next belief ``(1, D)``."""
+        """Return action ``(1, A)`` and next state ``(1, S)`` from the observation and the next belief ``(1, D)``."""
         z = self.rssm.take_in(h, self._embed(observation, *more), deterministic=True)
         return self.actor(join_features(h, z)).clipped_mean(), z
 
@@ -138,10 +138,10 @@ class ActorStep(nn.Module):
 
 
 class SampledActorStep(ActorStep):
-    """One acting step of explicit state whose z is a sample of the posterior, by the Gumbel-max trick.
+    """One step with explicit state whose z is a sample of the posterior, by the Gumbel-max trick.
 
-    The distribution is that of the training policy, which inverts the cumulative one instead. There rounding moves all
-    later classes' edges; here it matters only between the two best classes, so that copies flip less often.
+    The distribution is that of the training policy, which samples by inverting the cumulative distribution: there,
+    rounding shifts the edges of all later classes; here, only a tie of the two best classes can flip in a copy.
 
     Reference: Maddison et al., "A* Sampling", 2014.
     """
@@ -156,7 +156,7 @@ class SampledActorStep(ActorStep):
     def act(self, observation: Tensor, h: Tensor, *more: Tensor) -> tuple[Tensor, Tensor]:
         """Return action and next state; arguments as in `ActorStep.act`.
 
-        The last one is the noise: uniform numbers in [0, 1), ``(1, L, K)``.
+        The last argument is the noise: uniform numbers in [0, 1), ``(1, L, K)``.
         """
         *imu, noise = more
         probabilities = mix_uniform(self.rssm.posterior_logits(h, self._embed(observation, *imu)), self.rssm.unimix)
@@ -167,11 +167,11 @@ class SampledActorStep(ActorStep):
 
 
 class StepPart(nn.Module):
-    """A part of a step, to be written alone.
+    """One part of a step, as a module of its own for export.
 
     Args:
         step: The step.
-        name: Of `PARTS`.
+        name: A key of `PARTS`.
     """
 
     def __init__(self, step: ActorStep, name: str) -> None:
@@ -192,11 +192,11 @@ class StepPart(nn.Module):
 
 
 LATENTS: dict[str, type[ActorStep]] = {step.latent: step for step in (ActorStep, SampledActorStep)}
-"""What z is in an exported step, by name."""
+"""Classes of exported steps by latent mode."""
 
 
 def make_step(agent: Agent, latent: str) -> ActorStep:
-    """Make the step of a latent mode.
+    """Make the step of an agent with a latent mode.
 
     Raises:
         ValueError: Unknown latent mode, or an agent that cannot be exported.
@@ -220,14 +220,14 @@ def make_step(agent: Agent, latent: str) -> ActorStep:
 
 
 def check_output(output: str | Path) -> Path:
-    """Refuse what could only fail after the work is done.
+    """Check the output path and the installed packages before the export starts.
 
     Returns:
-        The absolute path of the ``.onnx`` file to be; its folder exists.
+        The absolute path of the ``.onnx`` file; its folder exists.
 
     Raises:
-        ValueError: Another suffix, or a folder that already holds the contract of another actor.
-        PermissionError: The folder cannot be written.
+        ValueError: The suffix is wrong, or the folder already holds the contract of another actor.
+        PermissionError: The folder is not writable.
         MissingPackagesError: Packages that the export needs are not installed.
     """
     missing = [name for name in PACKAGES if importlib.util.find_spec(name) is None]
@@ -253,10 +253,10 @@ def check_output(output: str | Path) -> Path:
 
 
 def _described(contract: Path) -> dict[str, str]:
-    """Return the names of the files that a contract describes, by kind; none if it is not there or cannot be read."""
+    """Return the file names in a contract by kind; empty if it does not exist or cannot be read."""
     try:
         files = json.loads(contract.read_text(encoding="utf-8"))["files"]
-        return {kind: Path(file["name"]).name for kind, file in files.items()}  # of its own folder, whatever it says
+        return {kind: Path(file["name"]).name for kind, file in files.items()}  # only files beside the contract
     except (OSError, ValueError, KeyError, TypeError, AttributeError):
         return {}
 
@@ -270,30 +270,30 @@ def export_actor(
     shared_weights: bool = False,
     parts: bool = False,
 ) -> dict[str, float]:
-    """Write a step as ``.onnx`` and ``.pt2`` with contract.json beside them, if all fly as the original does.
+    """Write a step as ``.onnx`` and ``.pt2`` with a contract.json, if all copies match the original.
 
     Args:
         step: The step.
-        contract: From `contract.make_contract`.
-        flight: To compare them over, at least ``MIN_STEPS`` steps.
-        output: Path of the ``.onnx`` file; others are named after its stem. Those of an earlier export, which its
-            contract names, are replaced.
-        seed: Of the noise that samples latents in the comparison.
-        shared_weights: Keep the weights in a file beside those of ONNX, which torch can read too, instead of inside of
-            each; the ``.pt2``, which would hold them once more, is compared and left out.
-        parts: Write the two `PARTS` of the step for ONNX, too.
+        contract: Contract from `contract.make_contract`.
+        flight: Flight for the comparison, at least ``MIN_STEPS`` steps.
+        output: Path of the ``.onnx`` file; the other files are named after its stem. Files of an earlier export, which
+            its contract names, are replaced.
+        seed: Seed of the noise that samples latents in the comparison.
+        shared_weights: Write the weights to one separate file for ONNX and torch, instead of into each ONNX file; the
+            ``.pt2``, which would hold them again, is compared but not kept.
+        parts: Also write the two `PARTS` of the step as ONNX files.
 
     Returns:
-        Largest deviation of an action from the original's, of each copy.
+        Largest deviation of an action from the original's, by copy.
 
     Raises:
-        ParityError: If one does not fly alike; no file is left and those of an earlier export stay.
-        ValueError: If the flight is too short, or the weights too many for one ONNX file; as `check_output`.
-        PermissionError, MissingPackagesError: As `check_output`.
+        ParityError: If a copy deviates too much; no new file is left and an earlier export is kept.
+        ValueError: If the flight is too short, or the weights too large for one ONNX file; see also `check_output`.
+        PermissionError, MissingPackagesError: See `check_output`.
     """
     check_steps(len(flight.observations))
     output = check_output(output)
-    earlier = set(_described(output.parent / CONTRACT).values())  # none but these are taken away
+    earlier = set(_described(output.parent / CONTRACT).values())  # only these may be removed
     partial = output.parent / f".{output.stem}.partial"
     shutil.rmtree(partial, ignore_errors=True)
     partial.mkdir()
@@ -330,7 +330,7 @@ def export_actor(
 
 
 def _verification(flight: RecordedFlight, deviation: dict[str, float]) -> dict[str, Any]:
-    """Return what the contract says about a comparison that was passed."""
+    """Return the contract's description of a passed comparison."""
     return {
         "steps": len(flight.observations),
         "episodes": flight.episodes,
@@ -341,10 +341,10 @@ def _verification(flight: RecordedFlight, deviation: dict[str, float]) -> dict[s
 
 
 def write_step(step: ActorStep, onnx: Path, program: Path) -> None:
-    """Write a step as ONNX file, weights inside, and as ``torch.export`` program.
+    """Write a step as ONNX file with its weights, and as ``torch.export`` program.
 
     Raises:
-        ValueError: If the weights are too many for one ONNX file.
+        ValueError: If the weights are too large for one ONNX file.
     """
     size = sum(parameter.nbytes for parameter in step.parameters())
     if size >= PROTOBUF_LIMIT:
@@ -353,12 +353,12 @@ def write_step(step: ActorStep, onnx: Path, program: Path) -> None:
 
 
 def write_onnx(step: ActorStep | StepPart, outputs: Sequence[str], path: Path) -> torch.export.ExportedProgram:
-    """Write a step, or a part of one, as ONNX file, weights inside; return the program that it was made from."""
+    """Write a step or a part of it as ONNX file with its weights; return the ``torch.export`` program."""
     inputs = step.example_inputs()
     with torch.no_grad():
         exported = torch.export.export(step, tuple(inputs.values()))
     for node in exported.graph.nodes:
-        # Paths of this machine's source files, which both formats would keep.
+        # Otherwise both formats would keep paths of this machine's source files.
         node.meta.pop("stack_trace", None)
     torch.onnx.export(
         exported,
@@ -373,9 +373,9 @@ def write_onnx(step: ActorStep | StepPart, outputs: Sequence[str], path: Path) -
 
 
 def share_weights(step: ActorStep, files: Sequence[Path], weights: Path) -> None:
-    """Write the weights of a step to a file, and have its ONNX files point into that instead of holding them.
+    """Write the weights of a step to a file, and replace those inside its ONNX files by references to it.
 
-    What the exporter has transformed, or has found to be equal to another weight, stays inside of an ONNX file.
+    Weights that the exporter has transformed, or merged with an equal one, stay inside the ONNX file.
     """
     import onnx as onnx_format
 

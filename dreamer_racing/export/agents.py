@@ -1,4 +1,4 @@
-"""The agents that ship, by their names; no torch."""
+"""Lookup of the included agents by name, without torch."""
 
 from __future__ import annotations
 
@@ -6,20 +6,20 @@ from pathlib import Path
 
 PACKAGE = Path(__file__).parents[1]
 AGENTS = next((path for path in (PACKAGE / "agents", PACKAGE.parent / "agents") if path.is_dir()), PACKAGE / "agents")
-"""Their folder: an installed package holds it, a clone has it beside the package."""
+"""Folder of the included agents: inside an installed package, beside the package in a clone."""
 
 
 def agent_path(name: str) -> Path:
-    """Return the folder of an agent that ships, by its name; else the path that the name is."""
+    """Return the folder of the included agent of this name, else the name as a path."""
     named = AGENTS / name
     return named if Path(name).name == name and (named / "agent.json").is_file() else Path(name)
 
 
 def existing_agent_path(setting_name: str, name: str) -> Path:
-    """Return what `agent_path` does, of something that is there.
+    """Return `agent_path(name)` if it exists.
 
     Raises:
-        FileNotFoundError: nothing is; the message names the setting, and the agents that ship.
+        FileNotFoundError: it does not; the message names the setting and the included agents.
     """
     path = agent_path(name)
     if not path.exists():
@@ -28,10 +28,10 @@ def existing_agent_path(setting_name: str, name: str) -> Path:
 
 
 def agents_that_ship() -> str:
-    """Return a sentence that names them."""
+    """Return a sentence that names the included agents, for error messages."""
     return f"Agents that ship, to be given by name: {', '.join(agents_in(AGENTS)) or 'none'}."
 
 
 def agents_in(folder: Path) -> list[str]:
-    """Return the names of the agents that lie in a folder, sorted."""
+    """Return the sorted names of the agents in a folder."""
     return sorted(path.parent.name for path in folder.glob("*/agent.json"))

@@ -1,4 +1,4 @@
-"""The contract of an exported actor: everything that those who fly it must know, as JSON values."""
+"""The contract of an exported actor: everything needed to run it, as JSON values."""
 
 from __future__ import annotations
 
@@ -26,18 +26,18 @@ def make_contract(
     imu: ImuErrors | None = None,
     **source: Any,
 ) -> dict[str, Any]:
-    """Describe everything that a step takes and gives, for those who fly it without this project.
+    """Return the contract of a step, which describes all inputs and outputs for users without this project.
 
     Args:
         step: The step.
-        parameters: Of the drone that the agent was trained with.
-        camera: Through which it saw.
-        imu: By how much its IMU erred; None without one.
-        source: Where it comes from, JSON values: checkpoint, env_steps, track and its `hash_track`, preset,
-            and where the track was a file, all of it by `describe_track`, ``track_description``.
+        parameters: Parameters of the drone that the agent was trained with.
+        camera: Camera that the agent was trained with.
+        imu: Errors of the IMU that the agent was trained with; None without one.
+        source: Origin of the agent, JSON values: checkpoint, env_steps, track and its `hash_track`, preset; and for a
+            track from a file its `describe_track` as ``track_description``.
 
     Returns:
-        What contract.json holds, but for ``files`` and ``verification``.
+        The content of contract.json without ``files`` and ``verification``.
     """
     size = step.size
     outputs = dict(zip(OUTPUTS, step(*step.example_inputs().values()), strict=True))
@@ -111,7 +111,7 @@ def _describe(tensors: Mapping[str, Tensor], sampled: bool) -> list[dict[str, An
 
 
 def describe_camera(camera: Camera) -> dict[str, Any]:
-    """Return what a contract says of a camera."""
+    """Return the contract's description of a camera."""
     return {
         "width_px": camera.width,
         "height_px": camera.height,
@@ -164,7 +164,7 @@ def _describe_action(parameters: QuadrotorParameters) -> dict[str, Any]:
 
 
 def describe_rate_loop(parameters: QuadrotorParameters) -> dict[str, Any]:
-    """Return what a contract says of the flight controller that an actor was trained with."""
+    """Return the contract's description of the flight controller that an actor was trained with."""
     firmware, widths = parameters.betaflight, parameters.randomisation
     if firmware is None:
         return {"kind": "proportional", "gain_per_s": parameters.rate_gain}
@@ -181,17 +181,17 @@ def describe_rate_loop(parameters: QuadrotorParameters) -> dict[str, Any]:
 
 
 def _half_widths(widths: Randomisation) -> dict[str, float]:
-    """Return by how much drones differed in training, relative to the one described here."""
+    """Return the half-widths of the randomisation in training, without the delay, which is described separately."""
     return {name: value for name, value in asdict(widths).items() if name != "delay_max"}
 
 
 def hash_weights(step: nn.Module) -> str:
-    """Return the SHA-256 of all weights of a step."""
+    """Return the SHA-256 of a step's weights."""
     return hash_tensors(step.state_dict())
 
 
 def hash_tensors(tensors: Mapping[str, Tensor]) -> str:
-    """Return the SHA-256 of tensors: name, type, shape and little-endian bytes of each, in order of names."""
+    """Return the SHA-256 of tensors over the name, type, shape and little-endian bytes of each, sorted by name."""
     digest = hashlib.sha256()
     for name, value in sorted(tensors.items()):
         digest.update(f"{name} {value.dtype} {tuple(value.shape)}\n".encode())

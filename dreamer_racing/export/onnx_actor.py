@@ -1,7 +1,7 @@
-"""Flies an exported actor on the vehicle's computer: numpy, onnxruntime and the standard library, nothing else.
+"""Runtime of an exported actor on the vehicle's computer; needs only numpy, onnxruntime and the standard library.
 
-The file stands alone: beside an installed `dreamer_racing` it is `dreamer_racing.export.onnx_actor`, and copied to
-the flight computer it is a module `onnx_actor` of its own. Run as a program it measures one step there:
+The file is self-contained: import it as `dreamer_racing.export.onnx_actor`, or copy it to the flight computer as the
+module `onnx_actor`. Run as a program, it measures the latency of one step:
 
     python onnx_actor.py actor.onnx --steps 1000
 
@@ -28,11 +28,11 @@ logger = logging.getLogger(__name__)
 
 CONTRACT = "contract.json"
 FORMAT, FORMAT_VERSIONS = "dreamer_racing.actor", (1, 2)
-"""A contract is of version 2 where the image is to be held between frames (``camera.rate_hz``), or there is an IMU."""
+"""Version 2 adds a camera slower than the control rate (``camera.rate_hz``: repeat the last image) and an IMU."""
 RECURRENT = ("h", "z", "previous_action")
 PARTS = {"advance": ("h_next",), "act": ("action", "z_next")}
-"""Outputs of the two parts of a step. The first takes all that is recurrent and ``is_init``, the second the
-observation, ``h_next`` and what there is of IMU and noise."""
+"""Outputs of the two parts of a step. Inputs of ``advance`` are the recurrent ones and ``is_init``; inputs of ``act``
+are the observation, ``h_next``, and the IMU and noise if the actor has them."""
 WARM_UP_STEPS = 20
 
 _TENSOR = {"name": str, "shape": [int], "type": str}
@@ -57,22 +57,22 @@ _LAYOUT = {
         "rate_hz?": float,
     },
 }
-"""What is read of a contract: keys and types of values; of a list, what each entry is. ``?``: may be absent or null."""
+"""Required keys and types of a contract. A list gives the layout of each entry. ``?``: may be absent or null."""
 _TYPES = ("uint8", "float32", "bool")
-_MOST = 100_000_000  # values of one input
+_MOST = 100_000_000  # maximum number of values of one input
 
 
 class RecurrentActor:
-    """Carries h, z and the previous action from step to step; what computes a step is the subclass's.
+    """Base class that carries h, z and the previous action from step to step; a subclass computes the step.
 
     Args:
-        contract: As `read_contract` returns it.
-        seed: Of the noise that samples latents, where the actor has any.
+        contract: The contract from `read_contract`.
+        seed: Seed of the noise that samples latents, if the actor has any.
 
     Attributes:
-        contract: As given.
-        state: What goes into the next step: ``h`` (1, D), ``z`` (1, S) and ``previous_action`` (1, A), float32. To be
-            set by hand before `prepare`, if at all.
+        contract: The contract.
+        state: Recurrent inputs of the next step: ``h`` (1, D), ``z`` (1, S) and ``previous_action`` (1, A), float32.
+            Change them only before `prepare`.
         is_init: Whether the next step is an episode's first.
     """
 
@@ -86,7 +86,7 @@ class RecurrentActor:
 
     @property
     def feels(self) -> bool:
-        """Whether a step takes what an IMU tells."""
+        """Whether the actor takes IMU measurements."""
         return "imu" in self._shapes
 
     @property
@@ -95,29 +95,29 @@ class RecurrentActor:
         return self._shapes["noise"][1:] if "noise" in self._shapes else None
 
     def reset(self) -> None:
-        """Begin an episode: the next step forgets everything before it."""
+        """Begin an episode: the next step ignores the state before it."""
         self.state = {name: np.zeros(self._shapes[name], np.float32) for name in RECURRENT}
         self.is_init = True
 
     def prepare(self) -> None:
-        """Do ahead of time what of the next step needs no observation, if this actor can; actions stay the same.
+        """Compute the part of the next step that needs no observation, if the actor supports it.
 
-        Worth it after a step, when its action is on its way.
+        Call it after each step, once the action is sent. Actions do not change.
         """
 
     def step(
         self, observation: np.ndarray, noise: np.ndarray | None = None, imu: np.ndarray | None = None
     ) -> np.ndarray:
-        """Take in what is seen now and return what to do; call it once per control period.
+        """Return the action for the current observation; call it once per control period.
 
         Args:
-            observation: uint8 RGB image (height, width, 3), top row first, or the float32 vector (V,) of an actor that
-                sees numbers; the contract's first input says which.
+            observation: uint8 RGB image (height, width, 3), top row first, or float32 vector (V,), as the contract's
+                first input specifies.
             noise: Only for ``latent=sample``: uniform numbers in [0, 1), float32 (L, K); drawn here if None.
-            imu: Only for actors with one (`feels`): body rates, rad/s, and specific force, m/s², FLU, float32 (6,).
+            imu: Only for actors with an IMU (`feels`): body rates, rad/s, and specific force, m/s², FLU, float32 (6,).
 
         Returns:
-            float32 (A,) in [−1, 1]; `setpoint` gives it units.
+            Action, float32 (A,) in [−1, 1]; `setpoint` converts it to units.
 
         Raises:
             ValueError: Wrong shape or type, numbers that are not finite, or noise or IMU for an actor that takes none.
@@ -142,7 +142,7 @@ class RecurrentActor:
         return action[0].copy()
 
     def setpoint(self, action: np.ndarray) -> np.ndarray:
-        """Give an action (A,) its units: collective thrust in m/s², body rates x, y, z in rad/s (body frame FLU)."""
+        """Convert an action (A,) to collective thrust in m/s² and body rates x, y, z in rad/s (body frame FLU)."""
         channels = self.contract["action"]["channels"]
         offset, scale = (np.array([channel[name] for channel in channels]) for name in ("offset", "scale"))
         return offset + scale * np.clip(action, -1.0, 1.0)
@@ -152,7 +152,7 @@ class RecurrentActor:
         raise NotImplementedError
 
     def _checked(self, name: str, value: Any, dtype: np.dtype) -> np.ndarray:
-        """Return an input with a leading 1, or refuse it."""
+        """Check an input's type, shape and values; return it with a batch dimension of 1."""
         shape = self._shapes[name][1:]
         if not isinstance(value, np.ndarray) or value.dtype != dtype or value.shape != shape:
             given = f"{value.dtype} of shape {value.shape}" if isinstance(value, np.ndarray) else type(value).__name__
@@ -165,21 +165,21 @@ class RecurrentActor:
 class OnnxActor(RecurrentActor):
     """An exported actor in onnxruntime, on the CPU.
 
-    Where its contract names the two parts of a step, ``advance`` and ``act``, these are run, so that `prepare` can do
-    the first one ahead of time; else the whole.
+    If the contract names the two parts of a step, ``advance`` and ``act``, the actor runs them, so that `prepare` can
+    run ``advance`` early; otherwise it runs the whole step.
 
     Args:
-        path: The ``.onnx`` file; its contract.json and its parts lie beside it.
-        seed: Of the noise that samples latents; only ``latent=sample`` has any.
+        path: The ``.onnx`` file, in one folder with its contract.json and its parts.
+        seed: Seed of the noise that samples latents; only for ``latent=sample``.
         threads: Threads that one step may use; more than one rarely helps at batch size 1.
-        whole: Run the whole step even where there are parts.
+        whole: Run the whole step even if there are parts.
 
     Attributes:
-        in_parts: Whether `prepare` takes something off the next step.
+        in_parts: Whether the actor runs the two parts, so that `prepare` has an effect.
 
     Raises:
-        FileNotFoundError: There is no such file, or no contract beside it.
-        ValueError: The contract is broken, of another version, or does not describe this file.
+        FileNotFoundError: The file, its contract or a part does not exist.
+        ValueError: The contract is invalid, of another version, or does not describe this file.
         ImportError: onnxruntime is not installed.
 
     Example:
@@ -193,8 +193,8 @@ class OnnxActor(RecurrentActor):
         path = Path(path)
         if not path.is_file():
             raise FileNotFoundError(f"There is no file {path}: give the .onnx file that recipes/export.py wrote.")
-        self._next_h: np.ndarray | None = None  # if it has been prepared
-        self._first_h: np.ndarray | None = None  # of an episode, which is always the same
+        self._next_h: np.ndarray | None = None  # set by `prepare`
+        self._first_h: np.ndarray | None = None  # h_next of an episode's first step, which is always the same
         super().__init__(read_contract(path.parent / CONTRACT), seed)
         self._check_files(path)
         described = self.contract["files"]
@@ -211,17 +211,17 @@ class OnnxActor(RecurrentActor):
         self._outputs = [entry["name"] for entry in self.contract["outputs"]]
 
     def reset(self) -> None:
-        """Begin an episode: the next step forgets everything before it."""
+        """Begin an episode: the next step ignores the state before it."""
         super().reset()
         self._next_h = None
 
     def prepare(self) -> None:
-        """Advance the belief, which needs no observation; where the actor is one piece, do nothing."""
+        """Advance the belief, which needs no observation; do nothing if the actor has no parts."""
         if self.in_parts and self._next_h is None and not self.is_init:
             self._next_h = self._advance()
 
     def _check_files(self, path: Path) -> None:
-        """Refuse a contract that belongs to other files; there are `weights` where the ONNX files hold none."""
+        """Check that all files exist and have the contract's hashes; ``weights`` is a file of external weights."""
         described = self.contract["files"]
         files = {"onnx": path}
         for kind in ("weights", *PARTS):
@@ -237,7 +237,7 @@ class OnnxActor(RecurrentActor):
                 )
 
     def _check_session(self, path: Path) -> None:
-        """Refuse a contract that promises what the file does not have."""
+        """Check that the ONNX file has the contract's inputs and outputs."""
         session = self._sessions["step"]
         for kind, arguments in (("inputs", session.get_inputs()), ("outputs", session.get_outputs())):
             there = [(argument.name, list(argument.shape)) for argument in arguments]
@@ -246,7 +246,7 @@ class OnnxActor(RecurrentActor):
                 raise ValueError(f"{path} has the {kind} {there}, but its contract promises {promised}.")
 
     def _check_parts(self, path: Path) -> None:
-        """Refuse parts that do not make the step that the contract promises."""
+        """Check that the parts have the inputs and outputs of the contract's step."""
         shapes = {entry["name"]: entry["shape"] for kind in ("inputs", "outputs") for entry in self.contract[kind]}
         before = [*RECURRENT, "is_init"]
         inputs = {"advance": before, "act": ["h_next", *(name for name in self._shapes if name not in before)]}
@@ -277,11 +277,11 @@ class OnnxActor(RecurrentActor):
 
 
 def read_contract(path: str | Path) -> dict[str, Any]:
-    """Read a contract.json, given it or its actor: the ``.onnx`` file beside it, or the folder of both.
+    """Read a contract.json, given its path, the ``.onnx`` file in the same folder, or the folder.
 
     Raises:
-        FileNotFoundError: There is none.
-        ValueError: It is no contract of an exported actor, or of another version.
+        FileNotFoundError: The contract does not exist.
+        ValueError: The file is no contract of an exported actor, or of another version.
     """
     path = Path(path)
     if path.is_dir() or path.suffix == ".onnx":
@@ -307,7 +307,7 @@ def read_contract(path: str | Path) -> dict[str, Any]:
 
 
 def _unlike(value: Any, layout: Any, name: str) -> str:
-    """Say where a value is not laid out as it should be; nothing if it is."""
+    """Return a message about the first mismatch between a value and its layout, or an empty string."""
     if isinstance(layout, dict):
         if not isinstance(value, dict):
             return f"{name} is {_short(value)}, not an object"
@@ -333,7 +333,7 @@ def _unlike(value: Any, layout: Any, name: str) -> str:
 
 
 def _unfit(contract: dict[str, Any]) -> str:
-    """Say what of a well laid out contract no actor has; nothing if all can be."""
+    """Return a message about the first inconsistency in a contract of correct layout, or an empty string."""
     names = [entry["name"] for entry in contract["inputs"]]
     if absent := [name for name in (*RECURRENT, "is_init") if name not in names]:
         return f"inputs lacks {', '.join(absent)}"
@@ -354,7 +354,7 @@ def _unfit(contract: dict[str, Any]) -> str:
 
 
 def _short(value: Any) -> str:
-    """A value as Python writes it, cut where it is long."""
+    """Return the `repr` of a value, shortened if it is long."""
     text = repr(value)
     return text if len(text) <= 60 else f"{text[:57]}..."
 
@@ -366,7 +366,7 @@ def hash_file(path: str | Path) -> str:
 
 
 class Latency(NamedTuple):
-    """Durations of single steps, ms."""
+    """Percentiles of step durations, ms."""
 
     p50: float
     p99: float
@@ -381,12 +381,12 @@ def measure_latency(
     observations: Sequence[np.ndarray] | np.ndarray,
     prepare: Callable[[], object] = lambda: None,
 ) -> Latency:
-    """Time single steps, after some that are not counted.
+    """Time single steps, after ``WARM_UP_STEPS`` untimed ones.
 
     Args:
         step: Called with one observation.
         observations: One for each timed step.
-        prepare: Called before each of them; what it takes is not counted.
+        prepare: Called before each step; its time is not counted.
     """
     for index in range(WARM_UP_STEPS):
         prepare()
@@ -411,7 +411,7 @@ def _open_session(path: Path, threads: int) -> Any:
 
 
 def main() -> None:
-    """Measure the latency of an exported actor on this computer, with noise for images."""
+    """Measure the latency of an exported actor on this computer, with noise as images."""
     parser = argparse.ArgumentParser(description="Measure the latency of one step of an exported actor.")
     parser.add_argument("path", help="the .onnx file")
     parser.add_argument("--steps", type=int, default=1000)

@@ -1,6 +1,6 @@
-"""Proof that copies of an actor fly alike: a recorded flight, what flies it again, and the comparison.
+"""Parity check of exported actors: replay a recorded flight with each copy and compare actions and latents.
 
-Shape legend: A action, L latents of C classes, V numbers, T steps of a recorded flight.
+Shape legend: A action, L latents of C classes, V vector entries, T steps of a recorded flight.
 """
 
 from __future__ import annotations
@@ -21,17 +21,17 @@ from dreamer_racing.modules import DreamerPolicy
 from dreamer_racing.modules.agent import Agent
 
 ACTION_TOLERANCE = 1e-4
-"""Largest deviation of an action, in [−1, 1], from the original's: 1.3 mm/s² of thrust, 0.001 rad/s."""
+"""Largest allowed deviation of an action, in [−1, 1], from the original's: 1.3 mm/s² of thrust, 0.001 rad/s."""
 LATENT_TOLERANCE = 1e-3
-"""Largest deviation of a latent's class from the original's: of its probability, or 1 where a sample is of another."""
+"""Largest allowed deviation of a class probability from the original's; a sample of another class deviates by 1."""
 MIN_STEPS = 200
-"""Steps of a recorded flight that an export must reproduce at least."""
+"""Minimum number of steps of a recorded flight."""
 MIN_EPISODES = 4
-"""Episodes, hence resets, that those steps are made of at least."""
+"""Minimum number of episodes, and so of resets, in a recorded flight."""
 
 
 class ParityError(RuntimeError):
-    """An exported copy of the actor does not fly as the original does."""
+    """The actions or latents of an exported actor deviate too much from the original's."""
 
 
 @dataclass(frozen=True)
@@ -41,8 +41,8 @@ class RecordedFlight:
     Attributes:
         observations: uint8 ``(T, height, width, 3)`` or float32 ``(T, V)``.
         is_init: Whether each step is its episode's first, bool ``(T,)``.
-        actions: What the policy did, ``(T, A)``.
-        imu: What the IMU told, float32 ``(T, 6)``; None without one.
+        actions: Actions of the policy, ``(T, A)``.
+        imu: IMU measurements, float32 ``(T, 6)``; None without an IMU.
     """
 
     observations: np.ndarray
@@ -58,15 +58,15 @@ class RecordedFlight:
 
 @torch.no_grad()
 def record_flight(env: DroneRacingEnv, agent: Agent, steps: int) -> RecordedFlight:
-    """Fly the deterministic policy in an environment of one drone and keep what it sees.
+    """Record a flight of the deterministic policy in an environment with one drone.
 
     Args:
-        env: ``num_envs=1``; give it ``episode_steps`` of `episode_steps`, so that there are resets.
-        agent: Whose policy flies.
+        env: Environment with ``num_envs=1``, and with ``episode_steps`` from `episode_steps`, so that there are resets.
+        agent: The agent with the policy.
         steps: T.
 
     Raises:
-        ValueError: An environment of several drones.
+        ValueError: The environment has several drones.
     """
     if env.batch_size != (1,):
         raise ValueError(f"env has batch size {list(env.batch_size)}; a flight is recorded with num_envs=1.")
@@ -84,7 +84,7 @@ def record_flight(env: DroneRacingEnv, agent: Agent, steps: int) -> RecordedFlig
 
 
 def episode_steps(steps: int) -> int:
-    """Return after how many steps to end an episode, so that a flight has several.
+    """Return the episode length in steps with which a flight has ``MIN_EPISODES`` episodes.
 
     Raises:
         ValueError: Fewer than ``MIN_STEPS`` steps.
@@ -94,7 +94,7 @@ def episode_steps(steps: int) -> int:
 
 
 def check_steps(steps: int) -> None:
-    """Refuse a flight that is too short to prove anything.
+    """Check that a flight is long enough for a comparison.
 
     Raises:
         ValueError: Fewer than ``MIN_STEPS`` steps.
@@ -104,12 +104,12 @@ def check_steps(steps: int) -> None:
 
 
 class TorchActor(RecurrentActor):
-    """Flies a step in torch as `OnnxActor` does in onnxruntime.
+    """A `RecurrentActor` that runs a step in torch.
 
     Args:
-        contract: Of the step.
+        contract: Contract of the step.
         step: An `ActorStep`, or the module of its ``torch.export`` program.
-        seed: Of the noise that samples latents.
+        seed: Seed of the noise that samples latents.
     """
 
     def __init__(
@@ -124,17 +124,17 @@ class TorchActor(RecurrentActor):
 
 
 def check_parity(actors: Mapping[str, RecurrentActor], flight: RecordedFlight, seed: int = 0) -> dict[str, float]:
-    """Fly actors through a recorded flight, each carrying its own state, and compare them with the first.
+    """Replay a recorded flight with each actor, and compare them with the first.
 
-    Where no latents are sampled, the first one is compared with what the policy did in that flight.
+    If latents are not sampled, the first actor is also compared with the recorded actions.
 
     Args:
-        actors: By name; the first is the original.
-        flight: What they see, and where episodes begin.
-        seed: Of the noise that samples latents, the same for all.
+        actors: Actors by name; the first is the original.
+        flight: The recorded flight.
+        seed: Seed of the noise that samples latents, the same for all.
 
     Returns:
-        Largest deviation of an action by name, without the first actor's.
+        Largest deviation of an action of each actor but the first, by name.
 
     Raises:
         ParityError: If an action deviates by more than ``ACTION_TOLERANCE``, or a latent by more than
@@ -157,7 +157,7 @@ def check_parity(actors: Mapping[str, RecurrentActor], flight: RecordedFlight, s
 
 
 def _replay(actor: RecurrentActor, flight: RecordedFlight, noise: np.ndarray | None) -> tuple[np.ndarray, np.ndarray]:
-    """Return the actions (T, A) and latents (T, L, C), samples or probabilities of their classes."""
+    """Return the actions (T, A) and the latents (T, L, C), as one-hot samples or class probabilities."""
     actions, latents = [], []
     for index, observation in enumerate(flight.observations):
         if flight.is_init[index]:
@@ -171,7 +171,7 @@ def _replay(actor: RecurrentActor, flight: RecordedFlight, noise: np.ndarray | N
 def _compare(
     original: str, expected: tuple[np.ndarray, np.ndarray], name: str, got: tuple[np.ndarray, np.ndarray]
 ) -> float:
-    """Return the largest deviation of an action, or raise at the first step where it or a latent's is too large."""
+    """Return the largest deviation of an action; raise if any deviation of an action or latent is too large."""
     deviation = np.abs(expected[0] - got[0]).max(1)  # (T,)
     drift = np.abs(expected[1] - got[1]).max(-1)  # (T, L)
     off = ~(drift <= LATENT_TOLERANCE)

@@ -1,8 +1,8 @@
-"""The agent that flies, out of a checkpoint of a run or out of a folder of its own that ships.
+"""Loading of agents for flight, from a run's checkpoint or from an agent folder.
 
-An agent folder holds `FILES`: the export of the actor with its contract, the weights that it and torch both read, the
-configuration of the run, and agent.json, which says where it comes from and how well it flies. Critic, heads, decoders,
-optimiser and replay are not in it.
+An agent folder holds `FILES`: the exported actor with its contract, the weights for ONNX and torch, the configuration
+of the run, and agent.json with the agent's origin and results. It lacks the critic, heads, decoders, optimiser and
+replay buffer.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ AGENT, CONFIG, ACTOR = "agent.json", "config.yaml", "actor.onnx"
 FILES = (ACTOR, WEIGHTS, CONTRACT, CONFIG, AGENT)
 AVERAGED, TRAINED = "averaged", "trained"
 CHOICES = ("auto", AVERAGED, TRAINED)
-"""Which weights of a checkpoint are to fly: ``auto`` takes the averaged ones where they are kept."""
+"""Choices of a checkpoint's weights: ``auto`` takes the averaged ones if the checkpoint has them."""
 
 _ABSENT = ("critic", "world_model.reward_head", "world_model.continue_head")
 _SETTINGS = {
@@ -37,19 +37,19 @@ _SETTINGS = {
     "camera.tilt_up_deg": "env.camera_tilt",
     "camera.rate_hz": "env.camera_rate",
 }
-"""Settings by what a contract calls them."""
+"""Names of settings by the contract's names."""
 
 
 def choose_weights(wanted: str, kept: str | tuple[str, ...], source: str | Path) -> str:
-    """Return which weights fly, ``averaged`` or ``trained``.
+    """Resolve a choice of weights to ``averaged`` or ``trained``.
 
     Args:
         wanted: One of ``CHOICES``.
-        kept: What there is.
+        kept: The weights in the source.
         source: Checkpoint or agent folder, for the message.
 
     Raises:
-        ValueError: If that is no choice, or not there.
+        ValueError: If the choice is unknown, or the source does not hold these weights.
 
     Example:
         >>> choose_weights("auto", ("averaged", "trained"), "runs/mine")
@@ -66,25 +66,25 @@ def choose_weights(wanted: str, kept: str | tuple[str, ...], source: str | Path)
 
 
 def kept_weights(state: dict[str, Any]) -> tuple[str, ...]:
-    """Say which weights the state of a learner holds."""
+    """Return which weights a learner's state holds."""
     return (AVERAGED, TRAINED) if AVERAGED in state else (TRAINED,)
 
 
 def load_agent(checkpoint: str | Path, interface: Interface, weights: str = "auto") -> tuple[Agent, dict[str, Any]]:
-    """Restore the agent of a checkpoint that flies, without decoders, on the CPU.
+    """Restore the agent of a checkpoint, without decoders, on the CPU.
 
     Args:
         checkpoint: Run directory, folder of checkpoints, or one checkpoint.
-        interface: What the agent sees and does.
+        interface: Observations and actions of the agent.
         weights: One of ``CHOICES``.
 
     Returns:
-        The agent and the checkpoint's metadata, with ``env_steps`` and with ``weights``, which of them these are.
+        The agent and the checkpoint's metadata with ``env_steps``, and the chosen weights' name as ``weights``.
 
     Raises:
         FileNotFoundError: If there is no complete checkpoint.
-        CheckpointError: If it has no learner.
-        ValueError: If its networks do not fit the interface, or it does not have those weights.
+        CheckpointError: If the checkpoint has no learner.
+        ValueError: If the networks do not fit the interface, or the checkpoint does not hold the chosen weights.
     """
     state, metadata = load_state(checkpoint, "learner")
     chosen = choose_weights(weights, kept_weights(state), checkpoint)
@@ -100,13 +100,13 @@ def load_agent(checkpoint: str | Path, interface: Interface, weights: str = "aut
 
 @dataclass
 class ShippedAgent:
-    """An agent out of a folder of its own.
+    """An agent loaded from an agent folder.
 
     Attributes:
-        folder: Where it lies.
-        agent: Encoder, RSSM and actor; it has no critic and no heads.
-        about: What agent.json says.
-        device: Where it acts.
+        folder: The agent folder.
+        agent: Encoder, RSSM and actor, without critic and heads.
+        about: Content of agent.json.
+        device: Device of the networks.
     """
 
     folder: Path
@@ -116,17 +116,16 @@ class ShippedAgent:
 
     @classmethod
     def load(cls, folder: str | Path, env: DroneRacingEnv, device: torch.device | str = "cpu") -> ShippedAgent:
-        """Restore an agent, to fly in an environment.
+        """Restore an agent for an environment.
 
         Args:
-            folder: Of the agent.
-            env: With the camera and the control rate that the agent was trained with.
-            device: Where it is to act.
+            folder: The agent folder.
+            env: An environment with the camera and the control rate of the agent's training.
+            device: Device of the networks.
 
         Raises:
             FileNotFoundError: If the folder lacks a file.
-            ValueError: If the environment is another than the agent was trained for, or the weights are not those that
-                contract.json describes.
+            ValueError: If the environment differs from that of training, or the weights differ from contract.json.
         """
         folder, device = Path(folder), torch.device(device)
         about, contract = read_about(folder), read_contract(folder / CONTRACT)
@@ -137,7 +136,7 @@ class ShippedAgent:
             parent, _, child = name.rpartition(".")
             agent.get_submodule(parent).register_module(child, None)
         load_networks(folder, agent)
-        # of what the file holds: a network of today may have a number that those of then had not
+        # Hash the file, not the network: newer networks may have entries that the file lacks.
         if hash_tensors(read_weights(folder / WEIGHTS)) != contract["weights_sha256"]:
             raise ValueError(
                 f"{folder / WEIGHTS} holds other weights than {folder / CONTRACT} describes: copy it again."
@@ -145,18 +144,18 @@ class ShippedAgent:
         return cls(folder, agent.requires_grad_(False).to(device), about, device)
 
     def evaluation_policy(self) -> DreamerPolicy:
-        """Return the acting step, which shares the agent's parameters."""
+        """Return the policy, which shares the agent's parameters."""
         return DreamerPolicy(self.agent.world_model, self.agent.actor)
 
     def value_function(self) -> None:
-        """Return None: the critic does not ship."""
+        """Return None, because an agent folder has no critic."""
 
 
 def load_networks(folder: Path, agent: Agent) -> None:
-    """Load what ships into the networks that fly: encoder, RSSM and actor.
+    """Load the weights of an agent folder into encoder, RSSM and actor.
 
     Raises:
-        ValueError: If they are of other shapes.
+        ValueError: If names or shapes differ.
     """
     weights = read_weights(folder / WEIGHTS)
     names = {"encoder": "world_model.encoder", "rssm": "world_model.rssm", "actor": "actor"}
@@ -170,7 +169,7 @@ def load_networks(folder: Path, agent: Agent) -> None:
 
 
 def is_agent(folder: str | Path) -> bool:
-    """Whether a folder is one of an agent."""
+    """Return whether a folder is an agent folder."""
     return (Path(folder) / AGENT).is_file()
 
 
@@ -179,7 +178,7 @@ def read_about(folder: str | Path) -> dict[str, Any]:
 
     Raises:
         FileNotFoundError: If the folder lacks a file.
-        ValueError: If agent.json is not readable.
+        ValueError: If agent.json is not valid JSON.
     """
     folder = Path(folder)
     _refuse_lacking(folder, *FILES)
@@ -195,12 +194,12 @@ def _refuse_lacking(folder: Path, *names: str) -> None:
 
 
 def check_env(folder: str | Path, contract: dict[str, Any], env: DroneRacingEnv) -> None:
-    """Refuse an environment in which an agent would see or act otherwise than it was trained to.
+    """Check that an environment has the observations and the control rate of an agent's training.
 
     Args:
-        folder: Of the agent, for the message.
-        contract: Of its actor.
-        env: To fly in.
+        folder: The agent folder, for the message.
+        contract: Contract of the actor.
+        env: The environment.
 
     Raises:
         ValueError: The message names the setting, the agent's value and the environment's.
@@ -226,7 +225,7 @@ def check_env(folder: str | Path, contract: dict[str, Any], env: DroneRacingEnv)
 
 
 def _size(saved: dict[str, Any]) -> ModelSize:
-    """Read a size as files keep it: lists for tuples, and perhaps more beside it."""
+    """Build a model size from its saved form, with lists as tuples; other entries are ignored."""
     names = {field.name for field in fields(ModelSize)}
     known = {name: value for name, value in saved.items() if name in names}
     size: dict[str, Any] = {name: tuple(value) if isinstance(value, list) else value for name, value in known.items()}

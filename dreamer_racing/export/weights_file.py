@@ -1,7 +1,7 @@
-"""Weights as a safetensors file, which torch reads and an ONNX file may point into.
+"""Weights as a safetensors file, which torch can read and an ONNX file can use as external data.
 
-A file is the length of a JSON header (8 bytes, little-endian), the header (name → type, shape, begin and end), and
-the bytes of all tensors. Nothing in it is executed when it is read.
+A file holds the length of a JSON header (8 bytes, little-endian), the header (name → type, shape, begin and end), and
+the bytes of all tensors. Reading it executes no code.
 
 Reference: huggingface/safetensors, ``README.md``, section Format.
 """
@@ -18,30 +18,30 @@ import numpy as np
 import torch
 from torch import Tensor
 
-_LENGTH = 8  # bytes of the header's length
-_ALIGNMENT = 8  # bytes, to a multiple of which the header is filled up with blanks
+_LENGTH = 8  # bytes of the length field
+_ALIGNMENT = 8  # bytes; the header is padded with blanks to a multiple of it
 _TYPE, _NUMPY = "F32", np.dtype("<f4")
 
 
 class Extent(NamedTuple):
-    """Where in the file the bytes of a tensor lie."""
+    """Offset and length of a tensor's bytes in the file."""
 
     offset: int
     length: int
 
 
 def write_weights(path: str | Path, weights: Mapping[str, Tensor]) -> dict[str, Extent]:
-    """Write float32 tensors in order of their names.
+    """Write float32 tensors, sorted by name.
 
     Args:
-        path: Of the file.
-        weights: Tensors of any shape.
+        path: The file.
+        weights: Tensors of any shape, by name.
 
     Returns:
-        Where each of them lies.
+        The extent of each tensor.
 
     Raises:
-        ValueError: If one is not float32.
+        ValueError: If a tensor is not float32.
     """
     header: dict[str, dict[str, Any]] = {}
     buffers, end = [], 0
@@ -60,11 +60,11 @@ def write_weights(path: str | Path, weights: Mapping[str, Tensor]) -> dict[str, 
 
 
 def read_weights(path: str | Path) -> dict[str, Tensor]:
-    """Read what `write_weights` wrote.
+    """Read a file written by `write_weights`.
 
     Raises:
-        FileNotFoundError: If there is no such file.
-        ValueError: If it is no such file, was cut off, or holds other than float32.
+        FileNotFoundError: If the file does not exist.
+        ValueError: If the file is of another kind or truncated, or holds types other than float32.
     """
     content = Path(path).read_bytes()
     first = _LENGTH + int.from_bytes(content[:_LENGTH], "little")

@@ -1,3 +1,3 @@
-"""Everything drawn or filmed."""
+"""Figures, videos and dashboards."""
 
 import dreamer_racing.envs  # noqa: F401 - heeds MUJOCO_GL before TorchRL imports MuJoCo

@@ -1,4 +1,4 @@
-"""Flights seen from outside, beside what the drone sees itself."""
+"""Videos of flights from an external chase camera, with or without the on-board view."""
 
 from __future__ import annotations
 
@@ -12,10 +12,10 @@ from dreamer_racing.figures.film import enlarge
 
 
 def chase_frames(view: ChaseView, trajectory: Trajectory) -> np.ndarray:
-    """Film a flight from outside.
+    """Render a flight from the chase camera.
 
     Args:
-        view: of one drone, N = 1, on the track that was flown.
+        view: chase view of one drone, N = 1, on the flight's track.
         trajectory: a recorded episode of K steps.
 
     Returns:
@@ -28,15 +28,15 @@ def chase_frames(view: ChaseView, trajectory: Trajectory) -> np.ndarray:
 
 
 def chase_beside_onboard(view: ChaseView, trajectory: Trajectory, gap: int = 8) -> np.ndarray:
-    """Compose view from outside | on-board view, or the former alone where there are no images.
+    """Compose chase view | on-board view, or the chase view alone if there are no images.
 
     Args:
-        view: of one drone, N = 1, on the track that was flown.
+        view: chase view of one drone, N = 1, on the flight's track.
         trajectory: a recorded episode of K steps.
-        gap: between the two, pixels.
+        gap: space between the views, pixels.
 
     Returns:
-        (K + 1, size, size + gap + width, 3) uint8: images are enlarged by the whole factor that fits, and centred.
+        (K + 1, size, size + gap + width, 3) uint8. On-board images are scaled by an integer factor and centred.
     """
     outside = chase_frames(view, trajectory)
     if trajectory.pixels is None:

@@ -1,4 +1,4 @@
-"""Variants of an experiment side by side: what each came to over its seeds, as numbers and as a table.
+"""Comparison of an experiment's variants: results aggregated over seeds, as numbers and as a table.
 
 Shapes: S seeds of a variant.
 """
@@ -15,23 +15,23 @@ from dreamer_racing.figures.curves import ENDS_EARLY, QUANTITIES
 from dreamer_racing.figures.runs import AXES, REFERENCE, CurveKey, RunData, along, axis_of, group_runs
 from dreamer_racing.training.clock import WALL_CLOCK
 
-LAST_SHARE = 0.2  # of the longest run of an algorithm on a track: where its variants are compared
-COMPARED = ("gates", "success_rate", "evaluation_return", "image_error")  # names out of `QUANTITIES`
+LAST_SHARE = 0.2  # length of the final window in which variants are compared, as a share of its end
+COMPARED = ("gates", "success_rate", "evaluation_return", "image_error")  # names in `QUANTITIES`
 COLUMNS = (*(QUANTITIES[name].column for name in COMPARED), *filter(None, (axis.clock for axis in AXES.values())))
 
 
 @dataclass(frozen=True)
 class VariantResult:
-    """What the runs of one variant came to.
+    """Results of the runs of one variant.
 
     Args:
         key: algorithm, track and variant.
-        seeds: S, runs that reach the window.
-        values: by name of ``COMPARED``, each run's mean over the window, (S,) or fewer where runs have no value there;
-            without those that no run has logged.
-        window: first and last place on the axis of what was averaged, common to all variants of the algorithm on the
+        seeds: S, number of runs that reach the window.
+        values: each run's mean over the window, by name in ``COMPARED``, (S,) or fewer if runs have no value there;
+            quantities that no run has logged are left out.
+        window: start and end of the averaging window on the axis, common to all variants of the algorithm on the
             track.
-        wall_clock: s, mean of these runs; None if none recorded it.
+        wall_clock: mean duration of these runs, s; None if no run recorded it.
     """
 
     key: CurveKey
@@ -42,24 +42,24 @@ class VariantResult:
 
     @property
     def name(self) -> str:
-        """Of the variant; settings in it are spelt as one gives them."""
+        """Display name of the variant; underscores become spaces, except in settings."""
         name = self.key.variant or REFERENCE
         return name if "=" in name else name.replace("_", " ")
 
 
 @dataclass(frozen=True)
 class Comparison:
-    """What a table or a picture of variants shows."""
+    """Content of a table or figure of variants."""
 
     results: list[VariantResult]
     problems: list[str]
-    """What was left out, a line each."""
+    """A line for everything left out."""
     axis: str = "env_steps"
-    """Along what runs were compared, one of `AXES`."""
+    """Axis along which runs were compared, one of `AXES`."""
 
     @property
     def caption(self) -> str:
-        """What the numbers are."""
+        """Explanation of the numbers."""
         of = f"{self.axis} that every variant has had" if axis_of(self.axis).clock else "longest run's env_steps"
         return (
             "Mean ± sample standard deviation (n − 1) over seeds, each the mean of what it logged within the last "
@@ -68,18 +68,18 @@ class Comparison:
 
 
 def compare_variants(runs: Sequence[RunData], problems: Sequence[str] = (), axis: str = "env_steps") -> Comparison:
-    """Average the ends of runs over the seeds of each variant; the reference comes first, then by name.
+    """Average runs over a final window and the seeds of each variant, sorted with the reference first, then by name.
 
-    Variants of one algorithm on one track are averaged over the same part of the axis: up to the env_steps of the
-    longest run, or up to the time that every variant has had, so that none is judged by more of it than another.
+    The window is the same for all variants of an algorithm on a track. It ends at the env_steps of the longest run, or
+    on a time axis at the time that every variant has reached, so that no variant has more time than another.
 
     Args:
-        runs: of any algorithms and tracks.
-        problems: what was left out already.
+        runs: runs of any algorithms and tracks.
+        problems: lines for what was left out before.
         axis: one of `AXES`.
 
     Raises:
-        ValueError: there are no runs, or those of one variant were not configured alike.
+        ValueError: there are no runs, or two runs of one variant have the same seed.
     """
     runs, without_clock = along(runs, axis)
     if not runs:
@@ -104,7 +104,7 @@ def _end(run: RunData) -> float:
 
 
 def _short_windows(ends: Mapping[tuple[str, str], Sequence[float]], axis: str) -> list[str]:
-    """Mention where variants are compared long before the longest of them ends, since one of them has had no more."""
+    """Return a note for each comparison on a time axis whose window ends long before the longest variant."""
     if not axis_of(axis).clock:
         return []
     form = axis_of(axis).form
@@ -136,7 +136,7 @@ def _result(key: CurveKey, group: Sequence[RunData], window: tuple[float, float]
 
 
 def comparison_table(comparison: Comparison) -> str:
-    """Write the results as Markdown; an empty cell was not measured, and one with fewer seeds than its row says so."""
+    """Return a Markdown table; empty cells were not measured, and cells with fewer seeds than their row give n."""
     results = comparison.results
     shown = [name for name in COMPARED if any(name in result.values for result in results)]
     labels = [QUANTITIES[name].label for name in shown]

@@ -1,4 +1,4 @@
-"""Learning curves over seeds: what is drawn, as numbers, and as a CSV file from which it can be drawn again.
+"""Learning curves aggregated over seeds, and their CSV file, from which the figure can be drawn again.
 
 Shapes: S seeds, P points of the common axis, D draws of the bootstrap.
 """
@@ -17,28 +17,28 @@ import numpy as np
 
 from dreamer_racing.figures.runs import AXES, CurveKey, RunData, along, axis_of, group_runs, is_metrics, runs_below
 
-CURVES = "learning_curves.csv"  # the file beside the figure, which draws it again
+CURVES = "learning_curves.csv"
 POINTS = 240  # P
-WINDOW_SHARE = 0.02  # of the longest run: the running mean's window, unless it is given
+WINDOW_SHARE = 0.02  # default window of the running mean, as a share of the longest run
 GAPS = "where an evaluation left no value, mean of the seeds that have one, and nothing where fewer than half do"
-ENDS_EARLY = 0.98  # of the longest run of a curve: one that ends before is mentioned
+ENDS_EARLY = 0.98  # runs that end before this share of a curve's longest run are reported
 WEIGHT = "curriculum/body_rate_weight"
 ALL_TRACKS = "all tracks"
 
 
 @dataclass(frozen=True)
 class Quantity:
-    """Something to draw while a run goes on."""
+    """A quantity that can be drawn as a learning curve."""
 
     label: str
     column: str
-    """Of `metrics.csv`."""
+    """Column of `metrics.csv`."""
     comparable: bool = False
-    """Whether the same value means the same on every track, so that tracks may be pooled: a rate from 0 to 1."""
+    """Whether it is a rate from 0 to 1, which is comparable across tracks, so that tracks may be pooled."""
     counted: bool = False
-    """Whether it is a number of things, which a bar or an axis may begin with: 0."""
+    """Whether it is a count, so that bars and axes begin at 0."""
     positive: bool = False
-    """Whether it is never negative, and its axis does not go below 0."""
+    """Whether it is never negative, so that its axis does not go below 0."""
 
 
 QUANTITIES = {
@@ -57,48 +57,48 @@ QUANTITIES = {
     "lap_time_best": Quantity("Best lap time (s, deterministic)", "evaluation/lap_time_best", positive=True),
     "image_error": Quantity("Image error (held out)", "held_out/image_error", positive=True),
 }
-"""Those of evaluations are of the deterministic or of the sampling (stochastic) policy, both paid at b₂ = 0."""
+"""Quantities by name; evaluations of the deterministic or stochastic policy have rewards at b₂ = 0."""
 PRESENCE = ("num_episodes", "return_mean")
-"""Columns, after `evaluation/` or `evaluation_stochastic/`, that have a value in the row of every evaluation."""
+"""Columns, after the prefix `evaluation/` or `evaluation_stochastic/`, with a value in every evaluation's row."""
 
 
 @dataclass(frozen=True)
 class Curve:
-    """One line of a figure and the band around it, all (P,)."""
+    """One line of a figure with its band, all (P,)."""
 
     key: CurveKey
     quantity: str
     x: np.ndarray
-    """Along the figure's axis."""
+    """Positions on the figure's axis."""
     centre: np.ndarray
     low: np.ndarray
-    """NaN, like `high`, where there is a single seed."""
+    """NaN, as is `high`, where there is a single seed."""
     high: np.ndarray
     seeds: np.ndarray
-    """int: how many runs have a value there."""
+    """int: number of runs with a value."""
 
 
 @dataclass(frozen=True)
 class LearningCurves:
-    """Everything that a figure of learning curves shows."""
+    """Content of a figure of learning curves."""
 
     curves: list[Curve]
     raises: dict[CurveKey, np.ndarray]
-    """Where on the axis the curriculum raised b₂, of all seeds together."""
+    """Positions on the axis where the curriculum raised b₂, for all seeds together."""
     aggregate: str
     window: float
-    """Of the running mean, in units of the axis."""
+    """Window of the running mean, in units of the axis."""
     problems: list[str]
-    """What was left out, a line each."""
+    """A line for everything left out."""
     axis: str = "env_steps"
     """One of `AXES`."""
 
 
 def wanted_columns(quantities: Sequence[str], axis: str = "env_steps") -> list[str]:
-    """Name the columns of `metrics.csv` that some quantities are drawn from along an axis.
+    """Return the columns of `metrics.csv` that are needed to draw quantities along an axis.
 
     Raises:
-        ValueError: unknown quantity or axis.
+        ValueError: a quantity or the axis is unknown.
     """
     clock = axis_of(axis).clock
     for name in quantities:
@@ -110,7 +110,7 @@ def wanted_columns(quantities: Sequence[str], axis: str = "env_steps") -> list[s
 
 
 def _presence(column: str) -> list[str]:
-    """Name the columns that tell in which rows this one could have had a value; none if it is no evaluation's."""
+    """Return the columns that mark the rows of evaluations, if the column is of evaluations; else none."""
     prefix = column.partition("/")[0]
     return [f"{prefix}/{name}" for name in PRESENCE] if prefix.startswith("evaluation") else []
 
@@ -126,15 +126,15 @@ def learning_curves(
     """Aggregate runs over seeds on a common axis.
 
     Args:
-        runs: of any algorithms and tracks.
-        quantities: names out of `QUANTITIES`.
+        runs: runs of any algorithms and tracks.
+        quantities: names in `QUANTITIES`.
         aggregate: ``mean`` (with the sample standard deviation) or ``iqm`` (interquartile mean with a 95 % interval).
-        window: of the running mean, in units of the axis; None for 2 % of the longest run.
-        problems: what was left out already.
+        window: window of the running mean, in units of the axis; None for 2 % of the longest run.
+        problems: lines for what was left out before.
         axis: one of `AXES`.
 
     Raises:
-        ValueError: no runs, an unknown name, or runs of one curve that were not configured alike.
+        ValueError: there are no runs or values, a name is unknown, or two runs of one curve have the same seed.
     """
     wanted_columns(quantities, axis)
     if aggregate not in AGGREGATES:
@@ -174,19 +174,19 @@ class Sampled(NamedTuple):
     """The runs of one curve on the common axis, (S, P) each."""
 
     values: np.ndarray
-    """NaN where a run has none."""
+    """NaN where a run has no value."""
     reached: np.ndarray
-    """bool: whether the run was being measured there, with a value or without."""
+    """bool: whether the point is within the measured range of the run, even without a value."""
 
     @property
     def has_gaps(self) -> bool:
-        """Whether some run has a value where another one was measured without."""
+        """Whether at some point one run has a value and another, although within its range, has none."""
         present = np.isfinite(self.values)
         return bool((present.any(0) & (self.reached & ~present).any(0)).any())
 
 
 def sample(group: Sequence[RunData], column: str, grid: np.ndarray, window: float) -> Sampled:
-    """Take the running means of runs on the common axis (P,), each as far as the run was measured."""
+    """Compute running means of runs on the common axis (P,), each within the measured range of its run."""
     tables = [measurements(run, column) for run in group]
     values = np.stack([resample(*table, grid, window) for table in tables])
     ends = np.array([(steps[0], steps[-1]) if len(steps) else (np.inf, -np.inf) for steps, _ in tables])  # (S, 2)
@@ -195,10 +195,10 @@ def sample(group: Sequence[RunData], column: str, grid: np.ndarray, window: floa
 
 
 def measurements(run: RunData, column: str) -> tuple[np.ndarray, np.ndarray]:
-    """Read a column, with NaN for every evaluation that left no value of it: a lap time without a lap.
+    """Return a column, with NaN for every evaluation without a value, for instance a lap time without a lap.
 
     Returns:
-        env_steps, rising, and values, (R,) each; empty if there is nothing.
+        Sorted env_steps and values, (R,) each; empty if there are none.
     """
     columns = run.metrics.columns
     steps, values = columns.get(column, (np.empty(0), np.empty(0)))
@@ -210,18 +210,17 @@ def measurements(run: RunData, column: str) -> tuple[np.ndarray, np.ndarray]:
 
 
 def resample(steps: np.ndarray, values: np.ndarray, grid: np.ndarray, window: float) -> np.ndarray:
-    """Take the running mean of a metric at other env_steps.
+    """Compute the running mean of a metric on a grid of env_steps.
 
     Args:
-        steps: (R,) env_steps of the values, rising.
-        values: (R,); NaN where the metric was looked for and not found.
+        steps: (R,) sorted env_steps of the values.
+        values: (R,); NaN where the metric was measured without a value.
         grid: (P,) env_steps to return values for.
-        window: env_steps around each, over which to average.
+        window: width of the window, env_steps.
 
     Returns:
-        (P,): at a row the mean of the values within the window, and straight lines from row to row, so that a window
-        that holds few rows makes no steps; NaN beside a row where the metric was not found, if the window reaches no
-        value, and beyond the ends.
+        (P,): the mean over the window at each row, interpolated linearly between rows, so that windows with few rows
+        cause no steps. NaN beyond the ends, and beside a row without a value if the window contains no value.
     """
     if not len(steps):
         return np.full(len(grid), np.nan)
@@ -231,7 +230,7 @@ def resample(steps: np.ndarray, values: np.ndarray, grid: np.ndarray, window: fl
 
 
 def _within(steps: np.ndarray, values: np.ndarray, places: np.ndarray, window: float) -> np.ndarray:
-    """Average the values (R,) within the window around each of some places (K,); NaN (K,) where there is none."""
+    """Return the mean of the values (R,) within the window around each place (K,); NaN if there is none."""
     first = np.searchsorted(steps, places - window / 2, "left")
     last = np.searchsorted(steps, places + window / 2, "right")
     found = np.isfinite(values)
@@ -242,21 +241,21 @@ def _within(steps: np.ndarray, values: np.ndarray, places: np.ndarray, window: f
 
 
 def weight_raises(run: RunData) -> np.ndarray:
-    """Find the env_steps at which the curriculum raised b₂ by a whole increment."""
+    """Return the env_steps at which the curriculum raised b₂ by a whole increment."""
     if WEIGHT not in run.metrics.columns:
         return np.empty(0)
     steps, weight = run.metrics.columns[WEIGHT]
-    # A row is the mean of what was in force since the row before: one between two levels is no level of its own.
+    # A row is the mean since the row before; a value between two levels is rounded down.
     levels = np.floor(weight / float(run.config.get("curriculum.increment") or 1e-9) + 1e-3)
     return steps[1:][np.diff(levels) > 0]
 
 
 def interquartile_mean(scores: np.ndarray) -> np.ndarray:
-    """Average the middle half of S runs (S, ...): a quarter, rounded down, is cut off at either end.
+    """Return the mean of the middle half of S runs (S, ...): a quarter, rounded down, is cut off at either end.
 
     Reference: Agarwal et al., Deep Reinforcement Learning at the Edge of the Statistical Precipice, NeurIPS 2021.
     """
-    import scipy.stats  # a second, which training does without
+    import scipy.stats  # takes a second; not needed in training
 
     return scipy.stats.trim_mean(scores, 0.25, axis=0)
 
@@ -267,16 +266,16 @@ def bootstrap_interval(
     draws: int = 2000,
     seed: int = 0,
 ) -> np.ndarray:
-    """Bound a statistic of pooled runs by a stratified percentile bootstrap: every track keeps its number of runs.
+    """Return a stratified percentile-bootstrap interval of a statistic; every track keeps its number of runs.
 
     Reference: Agarwal et al., 2021, whose library rliable is not used: it needs arch, pandas and seaborn, and its
     stratified bootstrap draws from numpy's global generator.
 
     Args:
         strata: the runs of each track, (S, P).
-        statistic: of an array (S, ...) along its first axis.
+        statistic: function of an array (S, ...) along its first axis.
         draws: D.
-        seed: of the draws.
+        seed: seed of the draws.
 
     Returns:
         (2, P): the 2.5 and the 97.5 percentile.
@@ -296,11 +295,11 @@ def _mean(scores: np.ndarray) -> np.ndarray:
 
 
 AGGREGATES = {"mean": (_mean, _deviation), "iqm": (interquartile_mean, bootstrap_interval)}
-"""The centre of runs (S, P), and the band (2, P) around it of runs by track."""
+"""Functions for the centre, from runs (S, P), and for the band (2, P), from runs by track."""
 
 
 def _aggregate(key: CurveKey, quantity: str, grid: np.ndarray, strata: list[Sampled], aggregate: str) -> Curve:
-    """Aggregate the runs of each stratum, at every point those that have a value there, if that is half of them."""
+    """Aggregate strata of runs at every point where at least half of the runs in range have a value."""
     present = np.isfinite(np.concatenate([stratum.values for stratum in strata]))  # (S, P)
     reached = np.concatenate([stratum.reached for stratum in strata])  # (S, P)
     shown = present & (2 * present.sum(0) >= (present | reached).sum(0))
@@ -312,13 +311,13 @@ def _aggregate(key: CurveKey, quantity: str, grid: np.ndarray, strata: list[Samp
         kept = [stratum.values[runs][:, points] for stratum, runs in zip(strata, chosen, strict=True) if runs.any()]
         if kept:
             result[0, points] = centre(np.concatenate(kept))
-        if max(map(len, kept), default=0) > 1:  # one run knows of no spread
+        if max(map(len, kept), default=0) > 1:  # a single run has no spread
             result[1:, points] = band(kept)
     return Curve(key, quantity, grid, result[0], result[1], result[2], present.sum(0))
 
 
 def _pool(sampled: dict[CurveKey, Sampled]) -> dict[CurveKey, list[Sampled]]:
-    """Put the tracks of an algorithm together, if it has been run on all of several."""
+    """Pool the tracks of each variant that was run on all tracks, if there are several."""
     tracks = {key.track for key in sampled}
     pooled: dict[CurveKey, list[Sampled]] = defaultdict(list)
     for key, value in sampled.items():
@@ -327,7 +326,7 @@ def _pool(sampled: dict[CurveKey, Sampled]) -> dict[CurveKey, list[Sampled]]:
 
 
 def _short_runs(groups: dict[CurveKey, list[RunData]], axis: str) -> list[str]:
-    """Mention the runs that end before the others of their curve do."""
+    """Return a line for each run that ends before the longest run of its curve."""
     lines, form = [], axis_of(axis).form
     for group in groups.values():
         ends = [run.metrics.env_steps.max(initial=0) for run in group]
@@ -341,11 +340,11 @@ def _short_runs(groups: dict[CurveKey, list[RunData]], axis: str) -> list[str]:
 
 _KEYS = ("quantity", "track", "algorithm", "variant")
 _VALUES = ("centre", "low", "high", "seeds")
-_RAISE = "b2_raised"  # in the column quantity, of rows that have no value
+_RAISE = "b2_raised"  # in the column quantity, for rows without values
 
 
 def write_curves(path: str | Path, curves: LearningCurves) -> None:
-    """Write curves as one CSV file, a row a point, under lines with `#` that say how they were made.
+    """Write curves as one CSV file, one row per point, after header lines with `#` that hold the settings.
 
     Columns: `quantity`, `track`, `algorithm`, `variant`, one named as the axis, `centre`, `low`, `high`, `seeds`.
     """
@@ -365,7 +364,7 @@ def write_curves(path: str | Path, curves: LearningCurves) -> None:
 
 
 def curves_file(path: str | Path) -> Path | None:
-    """Find what `write_curves` wrote: a file that is no `metrics*.csv` of a run, or that of a folder without runs."""
+    """Return the curves file that a path names: a CSV that is no metrics table, or the one in a folder without runs."""
     path = Path(path).expanduser()
     if path.is_dir():
         file = path / CURVES
@@ -374,10 +373,10 @@ def curves_file(path: str | Path) -> Path | None:
 
 
 def read_curves(path: str | Path) -> LearningCurves:
-    """Read what `write_curves` wrote.
+    """Read a file written by `write_curves`.
 
     Raises:
-        ValueError: this is no such file.
+        ValueError: the file is of another kind.
     """
     with Path(path).open(newline="", encoding="utf-8") as file:
         lines = file.readlines()

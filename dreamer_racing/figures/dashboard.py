@@ -1,7 +1,7 @@
-"""A page of one flight or two, in one HTML file: the race in 3-D with a scrubber, and beside it what the drone did.
+"""A page of one or two flights in a single HTML file: the race in 3-D with a scrubber, and a panel with data.
 
-The file is viser's own recording (`RaceScene`), which brings its viewer with it, and a panel of ours in the same
-document whose images, numbers and cursor follow the time on viser's scrubber.
+The file combines viser's recording of a `RaceScene`, which includes the viewer, with a panel whose images, numbers and
+cursor follow the time of viser's scrubber.
 Shapes: K control steps of an episode; F flights, one or two.
 """
 
@@ -25,22 +25,22 @@ if TYPE_CHECKING:
     import viser
 
 LOOPBACK = "127.0.0.1"
-"""Whatever serves a page is reached from this machine alone."""
+"""Servers listen on the loopback interface only."""
 KEYS = "Space plays and pauses, comma and full stop go a step back and on; a click on a curve goes there."
-HOLD = 1.0  # s that a recording rests at its end before it begins anew
+HOLD = 1.0  # s that the last frame is held before the recording repeats
 
 
 def write_page(path: str | Path, track: Track, flights: Sequence[ShownFlight], training: Sequence[str] = ()) -> int:
-    """Write the page of a flight, or of two in one scene.
+    """Write the page of one or two flights in one scene.
 
     Args:
-        path: the file; missing folders are made.
-        track: that all are of.
-        flights: one or two.
-        training: how to see the curves of their training, a line each; commands between backquotes.
+        path: the file; missing folders are created.
+        track: the track of all flights.
+        flights: one or two flights.
+        training: lines that say how to see the flights' training curves, with commands between backquotes.
 
     Returns:
-        Its size, bytes.
+        Size of the file, bytes.
 
     Raises:
         ValueError: viser is not installed.
@@ -55,7 +55,7 @@ def write_page(path: str | Path, track: Track, flights: Sequence[ShownFlight], t
 
 
 def record(track: Track, flights: Sequence[ShownFlight]) -> str:
-    """Return viser's page of the flights, which plays them from their beginnings on."""
+    """Return viser's HTML page that plays the flights from their start."""
     trajectories = [flight.trajectory for flight in flights]
     times = moments(trajectories)
     with quiet_server(port=0) as server:
@@ -70,7 +70,7 @@ def record(track: Track, flights: Sequence[ShownFlight]) -> str:
 
 @contextlib.contextmanager
 def quiet_server(port: int) -> Iterator[viser.ViserServer]:
-    """Start a viser server for this machine alone, without the banner that it prints; stop it in the end."""
+    """Run a viser server on the loopback interface within a context, without its printed banner."""
     import viser
 
     with contextlib.redirect_stdout(io.StringIO()):
@@ -83,10 +83,10 @@ def quiet_server(port: int) -> Iterator[viser.ViserServer]:
 
 
 def compose(viewer: str, track: Track, flights: Sequence[ShownFlight], training: Sequence[str]) -> str:
-    """Put the panel beside viser's viewer, into its page.
+    """Insert the panel into viser's page.
 
     Raises:
-        RuntimeError: that page is not built as this version of the package expects.
+        RuntimeError: the page's HTML differs from that of the expected viser version.
     """
     names = " against ".join(flight.title for flight in flights)
     title, end = "<title>Viser</title>", "</body>"
@@ -105,6 +105,6 @@ def compose(viewer: str, track: Track, flights: Sequence[ShownFlight], training:
 
 
 def moments(flights: Sequence[Trajectory]) -> list[float]:
-    """Return when something moves: the times of all rows of all flights, rising, s."""
+    """Return the distinct times of all rows of all flights, sorted, s."""
     times = sorted(row * flight.control_dt for flight in flights for row in range(len(flight.position)))
     return [time for before, time in pairwise([-1.0, *times]) if time - before > 1e-9]

@@ -1,4 +1,4 @@
-"""The page of a flight, or of two, live from viser's own server: the same scene and panel, moved from here."""
+"""Live page of one or two flights on a viser server, with the scene and panel of `dashboard`."""
 
 from __future__ import annotations
 
@@ -21,14 +21,14 @@ from dreamer_racing.figures.dashboard_panel import (
 )
 from dreamer_racing.figures.scene_3d import RaceScene, check_viser, paints
 
-FRAME = 0.04  # s between two pictures while it plays
+FRAME = 0.04  # s between frames during playback
 IN_VISER = """
 .dashboard { padding: 4px 12px }
 .dashboard .state, .dashboard output { display: none }
 .numbers { width: calc(100% - 24px); margin: 0 12px; text-align: left; font-size: 12px; line-height: 1.25 }
 .numbers th { font-weight: 400; color: #868e96 }
 """
-"""What is other than in the file: viser gives the panel its place, and the numbers stand below viser's slider."""
+"""CSS differences from the page in a file: viser places the panel, and numbers are shown below viser's slider."""
 
 
 def serve(
@@ -39,15 +39,15 @@ def serve(
     announce: Callable[[str], None] = lambda address: None,
     goes_on: Callable[[], bool] = lambda: True,
 ) -> None:
-    """Show flights to browsers on this machine until told to end.
+    """Serve a live page of flights to browsers on this machine until ``goes_on`` returns False.
 
     Args:
-        track: that all are of.
-        flights: one or two.
-        port: where; the next free one if it is taken.
-        training: as of `write_page`.
-        announce: is told the address, once there is something to see.
-        goes_on: is asked between two pictures whether to go on.
+        track: the track of all flights.
+        flights: one or two flights.
+        port: the port; if taken, the next free one.
+        training: see `write_page`.
+        announce: called with the address once the page is ready.
+        goes_on: called before each frame; returns whether to continue.
 
     Raises:
         ValueError: viser is not installed.
@@ -77,7 +77,7 @@ def serve(
 
 
 def positions(rows: Sequence[int], share: float) -> str:
-    """Return where the cursor stands, and which image of its sheet each view shows, as rules of style."""
+    """Return CSS rules with the cursor position and the image that each view shows from its sheet."""
     views = (
         f".dashboard .view-{index} {{ --column: {row % SHEET_COLUMNS} !important;"
         f" --row: {row // SHEET_COLUMNS} !important }}"
@@ -87,7 +87,7 @@ def positions(rows: Sequence[int], share: float) -> str:
 
 
 def number_table(track: Track, flights: Sequence[ShownFlight], rows: Sequence[int]) -> str:
-    """Return lap, gate and every trace of each flight at its row, as a table."""
+    """Return an HTML table with lap, gate and all traces of each flight at its row."""
     columns = []
     for (_, trajectory), paint, row in zip(flights, paints(len(flights)), rows, strict=True):
         cells = list(state_words(track, trajectory)[row])

@@ -1,6 +1,6 @@
-"""What stands beside the race on the page of a flight: legend, on-board image, state, and curves, as HTML.
+"""The panel of a flight's page as HTML: legend, on-board images, state, and curves beside the 3-D scene.
 
-Nothing in it moves by itself: who shows it sets the cursor's place and each view's image, and fills the numbers in.
+The panel is static: the page's script or server sets cursor position, images and numbers.
 Shapes: K control steps of an episode; F flights, one or two.
 """
 
@@ -27,16 +27,16 @@ from dreamer_racing.figures.drawing import speed_scale
 from dreamer_racing.figures.hud import laps_completed
 from dreamer_racing.figures.scene_3d import DRONE_SCALE, Paint, paints
 
-SHEET_COLUMNS = 25  # images in a row of the sheet that holds those of a flight
-CURVE_WIDTH, CURVE_HEIGHT = 1000.0, 100.0  # of a curve's own coordinates
-HEADROOM = 0.06  # of a curve's range, above and below it
-COLOR_STOPS = 8  # of a legend's gradient
-STYLE = "dashboard.css"  # beside this module
+SHEET_COLUMNS = 25  # images per row of the sheet with all images of a flight
+CURVE_WIDTH, CURVE_HEIGHT = 1000.0, 100.0  # in a curve's SVG coordinates
+HEADROOM = 0.06  # space above and below a curve, as a share of its range
+COLOR_STOPS = 8  # number of colours in a legend's gradient
+STYLE = "dashboard.css"  # in this module's folder
 LARGER = f"Drones are drawn {DRONE_SCALE:g} times their size."
 
 
 class ShownFlight(NamedTuple):
-    """A recorded episode from its start on, and what it is called."""
+    """A recorded episode from its start, and its title."""
 
     title: str
     trajectory: Trajectory
@@ -44,16 +44,16 @@ class ShownFlight(NamedTuple):
 
 @dataclass(frozen=True)
 class Trace:
-    """Something that is drawn over time."""
+    """A quantity that is drawn over time."""
 
     name: str
     unit: str
     values: Callable[[Trajectory], np.ndarray | None]
-    """(K + 1,) at observations or (K,) at steps; None of a flight that does not have it."""
+    """Returns (K + 1,) at observations or (K,) at steps; None if the flight lacks the quantity."""
 
 
 def command(channel: int) -> Callable[[Trajectory], np.ndarray]:
-    """Return what reads a channel of the action in SI units, as flown: 0 is thrust, 1 to 3 are body rates."""
+    """Return a function from a flight to a channel of its clipped actions in SI units: 0 thrust, 1 to 3 body rates."""
     drone = QuadrotorParameters()  # every preset has these scales
     scale = (drone.collective_thrust_scale, *drone.body_rate_max)[channel]
     offset = drone.collective_thrust_scale if channel == 0 else 0.0
@@ -68,11 +68,11 @@ TRACES = (
     Trace("yaw rate", "rad/s", command(3)),
     Trace("value", "return expected", lambda flight: None if flight.value is None else flight.value.numpy()),
 )
-"""The curves of a page: speed, the actor's four commands, and what its critic expected."""
+"""The curves of a page: speed, the actor's four commands, and the critic's value."""
 
 
 def panel(track: Track, flights: Sequence[ShownFlight], training: Sequence[str]) -> str:
-    """Return the panel: legend, images, state, curves, notes."""
+    """Return the HTML of the panel: legend, images, state, curves, notes."""
     colors = paints(len(flights))
     shown = list(zip(flights, colors, strict=True))
     lines = [*training, *(line for flight in flights for line in missing(flight)), LARGER]
@@ -86,7 +86,7 @@ def panel(track: Track, flights: Sequence[ShownFlight], training: Sequence[str])
 
 
 def missing(flight: ShownFlight) -> Iterator[str]:
-    """Yield what a flight does not show, and why, a sentence each."""
+    """Yield a sentence with the reason for everything that a flight's page cannot show."""
     if flight.trajectory.pixels is None:
         yield f"{flight.title}: no images, because none were recorded with the flight."
     if flight.trajectory.value is None:
@@ -94,7 +94,7 @@ def missing(flight: ShownFlight) -> Iterator[str]:
 
 
 def readings(track: Track, flights: Sequence[ShownFlight]) -> dict[str, Any]:
-    """Return what the panel says at each row of each flight; nothing but what JSON knows."""
+    """Return the panel's words and numbers at each row of each flight, as JSON values."""
     return {
         "duration": duration([flight.trajectory for flight in flights]),
         "columns": SHEET_COLUMNS,
@@ -114,7 +114,7 @@ def readings(track: Track, flights: Sequence[ShownFlight]) -> dict[str, Any]:
 
 
 def state_words(track: Track, flight: Trajectory) -> list[list[str]]:
-    """Say lap, next gate and what goes on at every row of a flight, K + 1 times."""
+    """Return lap, next gate and status at each of the K + 1 rows of a flight."""
     laps = np.minimum(laps_completed(flight) + 1, track.laps).tolist()
     gates = (flight.target_gate + 1).tolist()
     words = [
@@ -125,7 +125,7 @@ def state_words(track: Track, flight: Trajectory) -> list[list[str]]:
 
 
 def image_sheet(pixels: np.ndarray) -> str:
-    """Return the images of a flight (K + 1, H, W, 3) as one, row by row, a data URI."""
+    """Return the images of a flight (K + 1, H, W, 3) as the data URI of one PNG, row by row."""
     count, height, width, channels = pixels.shape
     rows = math.ceil(count / SHEET_COLUMNS)
     sheet = np.zeros((rows * SHEET_COLUMNS, height, width, channels), np.uint8)
@@ -137,7 +137,7 @@ def image_sheet(pixels: np.ndarray) -> str:
 
 
 def _legend(shown: Sequence[tuple[ShownFlight, Paint]]) -> str:
-    """Say which colour is which flight, how it ended, and what its line's colours mean."""
+    """Return the HTML of the legend: each flight's colour, result, and colour scale of speeds."""
     top = speed_scale([flight.trajectory for flight, _ in shown]).vmax
     rows = []
     for flight, paint in shown:
@@ -151,7 +151,7 @@ def _legend(shown: Sequence[tuple[ShownFlight, Paint]]) -> str:
 
 
 def _result(flight: Trajectory) -> str:
-    """Say how a flight ended, and its lap times."""
+    """Return the outcome of a flight and its lap times as text."""
     ended = (flight.outcome or "recording stopped").replace("_", " ")
     completed = laps_completed(flight)
     ends = [0, *(np.flatnonzero(np.diff(completed)) + 1).tolist()]
@@ -160,7 +160,7 @@ def _result(flight: Trajectory) -> str:
 
 
 def _views(shown: Sequence[tuple[ShownFlight, Paint]]) -> str:
-    """Return a place for the on-board image of every flight that has some."""
+    """Return the HTML of the on-board images, or a note for a flight without images."""
     views = []
     for index, (flight, paint) in enumerate(shown):
         if (pixels := flight.trajectory.pixels) is None:
@@ -177,7 +177,7 @@ def _views(shown: Sequence[tuple[ShownFlight, Paint]]) -> str:
 
 
 def _state(track: Track, shown: Sequence[tuple[ShownFlight, Paint]]) -> str:
-    """Return a table of time, lap, gate and what goes on; its cells are filled as the time goes by."""
+    """Return the HTML table of time, lap, gate and status; the page updates its cells."""
     head = '<tr><td class="time" colspan="3" data-time>0.00 s</td></tr><tr><th>lap</th><th>gate</th><th></th></tr>'
     rows = [
         f'<tr style="--color: {paint.color}" title="{escape(flight.title)}">'
@@ -189,7 +189,7 @@ def _state(track: Track, shown: Sequence[tuple[ShownFlight, Paint]]) -> str:
 
 
 def _curves(shown: Sequence[tuple[ShownFlight, Paint]]) -> Iterator[str]:
-    """Yield the curves of each trace that at least one flight has, one below the other, and their time axis."""
+    """Yield the HTML of the curves of each trace that at least one flight has, and of their time axis."""
     longest = duration([flight.trajectory for flight, _ in shown])
     passes = "".join(_passes(flight.trajectory, paint, longest) for flight, paint in shown)
     for trace in TRACES:
@@ -219,14 +219,14 @@ def _curves(shown: Sequence[tuple[ShownFlight, Paint]]) -> Iterator[str]:
 
 
 def _zero(low: float, high: float) -> str:
-    """Return a line at zero, if it lies within a curve's range."""
+    """Return an SVG line at zero if zero is within a curve's range, else an empty string."""
     level = CURVE_HEIGHT * high / (high - low)
     inside = low < 0.0 < high
     return f'<line class="zero" x2="{CURVE_WIDTH:g}" y1="{level:.1f}" y2="{level:.1f}"/>' if inside else ""
 
 
 def _passes(flight: Trajectory, paint: Paint, longest: float) -> str:
-    """Return a thin line at every gate passed, a stronger one where a lap ends."""
+    """Return SVG lines at all gate passes, of another class where a lap ends."""
     lines, target = [], flight.target_gate.numpy()
     for row in (np.flatnonzero(np.diff(target)) + 1).tolist():
         place = CURVE_WIDTH * row * flight.control_dt / longest
@@ -238,7 +238,7 @@ def _passes(flight: Trajectory, paint: Paint, longest: float) -> str:
 
 
 def _points(values: np.ndarray, step: float, low: float, high: float) -> Iterator[str]:
-    """Yield the stretches of a curve without gaps; a step is so much of the whole width."""
+    """Yield the SVG points of each part of a curve without gaps; ``step`` is a share of the width."""
     place = CURVE_WIDTH * step * np.arange(len(values))
     level = CURVE_HEIGHT * (high - values) / (high - low)
     finite = np.isfinite(values)
@@ -248,7 +248,7 @@ def _points(values: np.ndarray, step: float, low: float, high: float) -> Iterato
 
 
 def _with_commands(line: str) -> str:
-    """Set what stands between backquotes as a command."""
+    """Convert text between backquotes to HTML code elements."""
     parts = escape(line).split("`")
     return "".join(f"<code>{part}</code>" if index % 2 else part for index, part in enumerate(parts))
 
@@ -258,15 +258,15 @@ def _number(value: float) -> float | None:
 
 
 def duration(flights: Sequence[Trajectory]) -> float:
-    """Return how long the longest of some flights is, s."""
+    """Return the duration of the longest flight, s."""
     return max((len(flight.position) - 1) * flight.control_dt for flight in flights)
 
 
 def row_at(flight: Trajectory, time: float) -> int:
-    """Return the row that a flight is at, its last one after its end."""
+    """Return the row of a flight at a time in s; the last row after its end."""
     return min(int(time / flight.control_dt + 1e-6), len(flight.position) - 1)
 
 
 def beside(name: str) -> str:
-    """Read a file that lies beside this module, as text."""
+    """Read a text file in this module's folder."""
     return Path(__file__).with_name(name).read_text(encoding="utf-8")

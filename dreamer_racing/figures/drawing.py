@@ -1,6 +1,6 @@
-"""Pictures of races: PNG, PDF or SVG by the path's suffix.
+"""Drawing of races, as PNG, PDF or SVG by the path's suffix.
 
-Everything is drawn on a `matplotlib.figure.Figure` of its own; pyplot and its global state are not touched.
+Each figure is a separate `matplotlib.figure.Figure`; pyplot and its global state are not used.
 Shapes: K control steps of an episode.
 """
 
@@ -31,7 +31,7 @@ DECOY_COLOR = "#c2255c"
 INK, MUTED, FAINT = "#212529", "#868e96", "#dee2e6"
 CRASH_COLOR = "#e03131"
 CRASH: dict[str, Any] = {"marker": "x", "markersize": 11, "color": CRASH_COLOR, "markeredgewidth": 2.6}
-"""Of a crash: two strokes behind the path, so that the end of a short flight is seen between them."""
+"""Marker of a crash: a cross behind the path, so that the end of a short flight stays visible."""
 START: dict[str, Any] = {
     "marker": "o",
     "markersize": 9,
@@ -39,17 +39,17 @@ START: dict[str, Any] = {
     "markeredgecolor": "#212529",
     "markeredgewidth": 1.8,
 }
-"""Of a start: a ring behind the path."""
+"""Marker of a start: a ring behind the path."""
 SPEED_COLORS: Colormap = LinearSegmentedColormap.from_list(
     "speed", ["#3b1f6b", "#2f5fb3", "#1fa2a6", "#7bc043", "#f2b705"]
 )
 ARROW_INTERVAL = 0.1  # s between camera arrows
 ARROW_LENGTH = 0.6  # m
-NOTE_LETTERS = 14  # of a note beside a figure, an inch of its width
+NOTE_LETTERS = 14  # letters of a note per inch of a figure's width
 
 
 def speed_scale(trajectories: Sequence[Trajectory]) -> Normalize:
-    """Return the scale of colours from 0 to the highest speed of some flights, rounded up to whole m/s."""
+    """Return the colour scale from 0 to the highest speed of the flights, rounded up to whole m/s."""
     top = max(float(np.nanmax(trajectory.speed.numpy())) for trajectory in trajectories)
     return Normalize(0.0, max(1.0, math.ceil(top)))
 
@@ -61,14 +61,14 @@ def draw_flight(
     plane: tuple[int, int] = (0, 1),
     tilt: float | None = None,
 ) -> None:
-    """Draw a path coloured by speed, the camera's directions along it, its start, and its end if that is a crash.
+    """Draw a path coloured by speed, the camera's directions along it, its start, and a crash at its end.
 
     Args:
-        axes: where; `draw_track` draws what belongs below.
+        axes: axes with the track from `draw_track`.
         trajectory: the flight.
-        speed: scale of the colours.
-        plane: the two world axes that are seen.
-        tilt: of the camera, degrees; None for the flight's own.
+        speed: colour scale.
+        plane: the two world axes shown.
+        tilt: tilt of the camera, degrees; None for the flight's own.
     """
     _draw_path(axes, trajectory, plane, speed)
     _draw_cameras(axes, trajectory, plane, tilt_of(trajectory) if tilt is None else tilt)
@@ -76,12 +76,12 @@ def draw_flight(
 
 
 def draw_track(axes: Axes, track: Track, labels: bool = True) -> None:
-    """Draw a track from above: its bounding box, gates and decoys, with equal scales on both axes.
+    """Draw a track from above with its bounding box, gates and decoys, at equal scales on both axes.
 
     Args:
-        axes: where.
+        axes: axes to draw on.
         track: the track.
-        labels: whether gates are numbered and axes labelled.
+        labels: whether to number gates and label axes.
     """
     (x_low, y_low, _), (x_high, y_high, _) = track.bounds_low, track.bounds_high
     axes.add_patch(Rectangle((x_low, y_low), x_high - x_low, y_high - y_low, **BOX))
@@ -99,13 +99,12 @@ def draw_track(axes: Axes, track: Track, labels: bool = True) -> None:
 
 
 def save(figure: Figure, path: str | Path, left_out: Sequence[str] = ()) -> None:
-    """Write a figure, and beside it what is not in it.
+    """Write a figure, and a text file that names what was left out of it.
 
     Args:
-        figure: which.
-        path: the file; missing folders are made.
-        left_out: what a reader must know, a line each; it is written to `left_out_of(path)`. Without any, what an
-            earlier figure of this name left out is removed.
+        figure: the figure.
+        path: the file; missing folders are created.
+        left_out: lines of the text file `left_out_of(path)`. If empty, such a file of an earlier figure is removed.
     """
     Path(path).parent.mkdir(parents=True, exist_ok=True)
     figure.savefig(path, dpi=150, facecolor="white")
@@ -116,12 +115,12 @@ def save(figure: Figure, path: str | Path, left_out: Sequence[str] = ()) -> None
 
 
 def left_out_of(path: str | Path) -> Path:
-    """Return the file that names, a line each, what was left out of the figure ``path``."""
+    """Return the path of the text file that names what was left out of the figure ``path``."""
     return Path(path).with_name(f"{Path(path).stem}_left_out.txt")
 
 
 def dress(axes: Axes) -> None:
-    """Draw a faint grid, and neither frame nor ticks."""
+    """Draw a faint grid without frame and ticks."""
     axes.set_axisbelow(True)
     axes.grid(color=FAINT, linewidth=0.6)
     axes.tick_params(colors=MUTED, labelsize=8, length=0)
@@ -129,24 +128,24 @@ def dress(axes: Axes) -> None:
 
 
 def from_zero(axes: Axes, least: float = 1.0) -> None:
-    """Let the vertical axis of what is never negative begin at 0 and end no lower than ``least``.
+    """Set the vertical axis of a non-negative quantity to begin at 0 and end at ``least`` or above.
 
-    Left alone, the axis of a single 0, or of nothing but zeros, shows as much below 0 as above.
+    By default, matplotlib centres the axis on 0 if all values are 0.
     """
     axes.set_ylim(0.0, max(least, axes.get_ylim()[1]))
 
 
 def tilt_of(trajectory: Trajectory) -> float:
-    """Return the tilt of the camera that a flight was flown by, degrees; the default one's where that is not known."""
+    """Return the tilt of a flight's camera, degrees, or the default camera's if it is unknown."""
     return Camera.tilt if trajectory.camera_tilt is None else trajectory.camera_tilt
 
 
 def camera_directions(attitude: torch.Tensor, tilt: float = Camera.tilt) -> torch.Tensor:
-    """Where the nose camera looks.
+    """Return the directions of the nose camera.
 
     Args:
         attitude: (..., 4) unit quaternions wxyz, body → world.
-        tilt: of the camera, upwards from the body's x axis, degrees.
+        tilt: tilt of the camera upwards from the body's x axis, degrees.
 
     Returns:
         (..., 3) unit vectors in the world.
@@ -172,7 +171,7 @@ BOX: dict[str, Any] = {
 
 
 def dress_map(axes: Axes, y_label: str | None) -> None:
-    """Give a map equal scales, a faint grid every 2 m and, if there is one, the label of its vertical axis."""
+    """Set equal scales, a faint grid every 2 m and an optional label of the vertical axis."""
     axes.set_aspect("equal")
     axes.xaxis.set_major_locator(MultipleLocator(2.0))
     axes.yaxis.set_major_locator(MultipleLocator(2.0))
@@ -182,9 +181,9 @@ def dress_map(axes: Axes, y_label: str | None) -> None:
 
 
 def _draw_gate(axes: Axes, gate: Gate, width: float, color: str) -> None:
-    """Draw a gate from above: a bar as wide as the frame, and arrows in the direction of flight at its ends.
+    """Draw a gate from above: a bar as wide as the frame, with arrows in the direction of flight at its ends.
 
-    In the middle they would lie under the path.
+    In the middle, the path would cover the arrows.
     """
     centre, left, forward = (np.array(vector[:2]) for vector in (gate.position, gate.left, gate.forward))
     ends = np.stack((centre - left * width / 2, centre + left * width / 2))  # (2, 2)
@@ -197,13 +196,13 @@ def _draw_gate(axes: Axes, gate: Gate, width: float, color: str) -> None:
 
 
 def _number_gate(axes: Axes, track: Track, number: int) -> None:
-    """Write a gate's number beside its outer end: the one farther from the middle of the track."""
+    """Write a gate's number beside the end that is farther from the middle of the track."""
     gate = track.gates[number - 1]
     middle = np.mean([other.position[:2] for other in track.gates], axis=0)
     centre, left = np.array(gate.position[:2]), np.array(gate.left[:2])
     outwards = 1.0 if np.dot(left, centre - middle) >= 0 else -1.0
     above = [other for other in track.gates[: number - 1] if math.dist(other.position[:2], gate.position[:2]) < 0.5]
-    side = -outwards if above else outwards  # one above the other: a number at either end
+    side = -outwards if above else outwards  # stacked gates have their numbers at opposite ends
     place = centre + side * left * (track.shape.outer / 2 + 0.45)
     axes.text(place[0], place[1], str(number), ha="center", va="center", fontsize=9, color=INK, bbox=BADGE, zorder=7)
 
@@ -217,7 +216,7 @@ def _draw_path(axes: Axes, trajectory: Trajectory, plane: tuple[int, int], speed
 
 
 def _draw_cameras(axes: Axes, trajectory: Trajectory, plane: tuple[int, int], tilt: float) -> None:
-    """Draw the camera's direction, projected into the plane, every 0.1 s."""
+    """Draw the camera's direction, projected onto the plane, every 0.1 s."""
     every = max(1, round(ARROW_INTERVAL / trajectory.control_dt))
     origin = trajectory.position[::every, list(plane)].numpy()  # (M, 2)
     direction = camera_directions(trajectory.attitude[::every], tilt)[:, list(plane)].numpy()
@@ -246,7 +245,7 @@ def _draw_ends(axes: Axes, trajectory: Trajectory, plane: tuple[int, int]) -> No
 
 
 def flight_legend(decoys: bool, crash: bool) -> list[Line2D]:
-    """Make the entries of the legend of a flight from above, with decoys or a crash if there are any."""
+    """Return the legend entries of a flight from above, optionally with decoys and a crash."""
     bar: dict[str, Any] = {"linewidth": 4.5, "solid_capstyle": "butt"}
     handles = [Line2D([], [], color=GATE_COLOR, label="gate", **bar)]
     if decoys:

@@ -1,4 +1,4 @@
-"""What evaluations have left in a run's folder: which files, how good each was, and the first that can be read."""
+"""Access to the evaluation files in a run's folder: paths, scores, and reading the first valid one."""
 
 from __future__ import annotations
 
@@ -15,19 +15,19 @@ from dreamer_racing.training.directory import RunDirectory
 
 T = TypeVar("T")
 
-REASON_LETTERS = 160  # of why a file cannot be read
+REASON_LETTERS = 160  # maximum length of the reason why a file cannot be read
 
 
 def evaluation_files(directory: Path, ending: str) -> list[Path]:
-    """Find what the evaluations of a run have left, during training and, by `recipes/evaluate.py`, after it.
+    """Find the files of a run's evaluations, during training and by `recipes/evaluate.py` after it.
 
     Args:
-        directory: of the run.
-        ending: of the files' names, after the env_steps or the policy's name.
+        directory: the run directory.
+        ending: suffix of the file names, after the env_steps or the policy's name.
 
     Returns:
-        The files: during training by env_steps, rising, then those of `evaluation`, `evaluation_2` ...; those of
-        stochastic policies are left out.
+        The files: first those of training, sorted by env_steps, then those of `evaluation`, `evaluation_2` ...; files
+        of stochastic policies are left out.
     """
     files = RunDirectory(directory).evaluations.glob(f"*{ending}")
     during = {int(name): file for file in files if (name := file.name.removesuffix(ending)).isdigit()}
@@ -38,7 +38,7 @@ def evaluation_files(directory: Path, ending: str) -> list[Path]:
 
 
 def evaluation_score(file: Path, ending: str) -> tuple[float, float]:
-    """Say how good the evaluation was that left a file: gates per episode, then the return; the worst if unknown."""
+    """Return the score of a file's evaluation, (gates per episode, mean return); −∞ if it cannot be read."""
     try:
         numbers = json.loads(file.with_name(f"{file.name.removesuffix(ending)}.json").read_text(encoding="utf-8"))
         return float(numbers["gates_per_episode"]), float(numbers["return_mean"])
@@ -47,15 +47,15 @@ def evaluation_score(file: Path, ending: str) -> tuple[float, float]:
 
 
 def first_readable(files: Iterable[Path], read: Callable[[Path], T], problems: list[str]) -> tuple[Path, T] | None:
-    """Read the first of some files of a run's evaluations that can be read.
+    """Read the first readable file among files of a run's evaluations.
 
     Args:
-        files: which, in the order of preference.
-        read: raises ValueError or OSError at what it cannot read.
-        problems: gets a line if files were passed over, with the run, the first of them and why.
+        files: the files, in order of preference.
+        read: function that reads a file and raises ValueError or OSError if it cannot.
+        problems: gets a line if files were skipped, with the run, the first of these files and the reason.
 
     Returns:
-        The file and what is in it; None if none of them can be read.
+        The file and its content; None if no file can be read.
     """
     failures: list[tuple[Path, Exception]] = []
     found = None

@@ -1,4 +1,4 @@
-"""Videos and GIFs of flights, and of a world model's predictions beside them.
+"""Videos and GIFs of flights and of a world model's predictions.
 
 Shapes: T frames of H × W pixels, RGB, uint8.
 """
@@ -25,9 +25,9 @@ from dreamer_racing.evaluation.dreams import Dream
 from dreamer_racing.evaluation.trajectory import Trajectory
 from dreamer_racing.figures.drawing import CRASH_COLOR, INK, SPEED_COLORS, camera_directions, draw_track, tilt_of
 
-VIDEO_HEIGHT = 256  # pixels that a video has at least, unless its scale is given
-CONTEXT_COLOR = (64, 160, 80)  # the model sees the images
-OPEN_LOOP_COLOR = (230, 120, 20)  # it predicts them from actions alone
+VIDEO_HEIGHT = 256  # minimum height of a video in pixels, unless its scale is given
+CONTEXT_COLOR = (64, 160, 80)  # the model observes the images
+OPEN_LOOP_COLOR = (230, 120, 20)  # the model predicts the images from actions alone
 WHITE = (255, 255, 255)
 MAP_MARGIN = 1.6  # m around the gates of a moving map
 MIN_DELAY = 0.02  # s; browsers show shorter GIF frames much longer
@@ -38,26 +38,26 @@ logger = logging.getLogger(__name__)
 def write_video(
     path: str | Path, frames: np.ndarray | torch.Tensor, fps: float = 50, scale: int | None = None, quality: int = 8
 ) -> bool:
-    """Write an H.264 (yuv420p) mp4 file that plays everywhere; without ffmpeg, write nothing and warn of it once.
+    """Write an H.264 (yuv420p) mp4 file, which most players support; without ffmpeg, write nothing and warn once.
 
     Args:
-        path: the file; missing folders are made.
+        path: the file; missing folders are created.
         frames: (T, H, W, 3) uint8.
         fps: frames per second.
-        scale: whole factor by which pixels are enlarged, without blurring; None for one that makes the video at least
-            256 pixels high. Odd sizes then grow by one pixel, because H.264 wants even ones.
+        scale: integer factor by which pixels are enlarged, without blurring; None for the smallest one that makes the
+            video at least 256 pixels high. Odd sizes then grow by one pixel, because H.264 needs even ones.
         quality: from 1 to 10.
 
     Returns:
-        Whether it was written.
+        Whether the file was written.
 
     Raises:
-        ValueError: frames of another shape or type, or none.
+        ValueError: the frames have another shape or type, or there are none.
     """
     array = _as_frames(frames, "frames")
     if not _finds_ffmpeg():
         return False
-    import imageio.v2 as imageio  # starts slowly
+    import imageio.v2 as imageio  # slow to import
 
     scale = math.ceil(VIDEO_HEIGHT / array.shape[1]) if scale is None else scale
     looks: Any = {"codec": "libx264", "pixelformat": "yuv420p", "quality": quality, "macro_block_size": 1}
@@ -71,10 +71,10 @@ def write_video(
 
 @contextmanager
 def swapped_in(path: str | Path) -> Iterator[Path]:
-    """Give a path beside a file, of the same kind, and put what is written there in the file's place when it is whole.
+    """Yield a temporary path with the suffix of a file, and replace the file by it when the block succeeds.
 
     Args:
-        path: the file; missing folders are made. It stays as it was if the block fails.
+        path: the file; missing folders are created. It is unchanged if the block fails.
     """
     path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
@@ -88,7 +88,7 @@ def swapped_in(path: str | Path) -> Iterator[Path]:
 
 @cache
 def _finds_ffmpeg() -> bool:
-    """Tell whether there is what makes videos; warn the first time if there is not."""
+    """Return whether ffmpeg is available; warn the first time if not."""
     try:
         import imageio_ffmpeg
 
@@ -107,21 +107,21 @@ def write_gif(
     colors: int = 64,
     loop: bool = True,
 ) -> int:
-    """Write a small GIF: one palette for all frames, no dithering, so that what stands still costs nothing.
+    """Write a small GIF with one palette for all frames and no dithering, so that unchanged pixels take no space.
 
     Args:
-        path: the file; missing folders are made.
+        path: the file; missing folders are created.
         frames: (T, H, W, 3) uint8.
-        fps: frames per second, 50 at most; the format counts in 1/100 s, to which the delay is rounded.
-        scale: whole factor by which pixels are enlarged, without blurring.
+        fps: frames per second, 50 at most; the delay is rounded to the format's unit of 1/100 s.
+        scale: integer factor by which pixels are enlarged, without blurring.
         colors: size of the palette, 2 to 256.
-        loop: whether it starts again.
+        loop: whether the GIF repeats.
 
     Returns:
         Size of the file, bytes.
 
     Raises:
-        ValueError: frames of another shape or type, or none.
+        ValueError: the frames have another shape or type, or there are none.
     """
     array = _as_frames(frames, "frames")
     palette = _shared_palette(array, colors)
@@ -151,23 +151,23 @@ def side_by_side(
     scale: int = 4,
     border: int = 4,
 ) -> np.ndarray:
-    """Compose on-board view | prediction | (if asked) absolute error.
+    """Compose on-board view | prediction | (optional) absolute error.
 
-    The prediction's border is green while the model sees the images and orange where it predicts open loop.
+    The prediction's border is green while the model observes the images and orange while it predicts open loop.
 
     Args:
         real: (T, H, W, 3) uint8.
         imagined: (T, H, W, 3) uint8.
-        context: number of first frames that the model saw.
+        context: number of first frames that the model observed.
         error: whether to add the absolute difference.
-        scale: whole factor by which pixels are enlarged, without blurring.
-        border: its width, pixels.
+        scale: integer factor by which pixels are enlarged, without blurring.
+        border: width of the borders, pixels.
 
     Returns:
         (T, scale H + 2 border, panels (scale W + 2 border), 3) uint8.
 
     Raises:
-        ValueError: frames of another shape or type, or of different shapes.
+        ValueError: the frames have another shape or type, or different shapes.
     """
     seen, predicted = _as_frames(real, "real"), _as_frames(imagined, "imagined")
     if seen.shape != predicted.shape:
@@ -186,17 +186,17 @@ def side_by_side(
 
 
 def enlarge(pixels: np.ndarray, scale: int) -> np.ndarray:
-    """Repeat every pixel of (..., H, W, 3)."""
+    """Enlarge (..., H, W, 3) by repeating pixels."""
     return pixels if scale == 1 else pixels.repeat(scale, axis=-3).repeat(scale, axis=-2)
 
 
 def enlarge_to_watch(pixels: np.ndarray) -> np.ndarray:
-    """Repeat every pixel of (T, H, W, 3) as often as `write_video` would by itself."""
+    """Enlarge (T, H, W, 3) by the default factor of `write_video`."""
     return enlarge(pixels, math.ceil(VIDEO_HEIGHT / pixels.shape[1]))
 
 
 def add_border(panel: np.ndarray, color: np.ndarray, border: int) -> np.ndarray:
-    """Put (T, H, W, 3) into a border of a colour for each frame (T, 3)."""
+    """Add a border to (T, H, W, 3), with one colour per frame (T, 3)."""
     frames, height, width, _ = panel.shape
     framed = np.empty((frames, height + 2 * border, width + 2 * border, 3), dtype=np.uint8)
     framed[:] = color[:, None, None]
@@ -205,13 +205,13 @@ def add_border(panel: np.ndarray, color: np.ndarray, border: int) -> np.ndarray:
 
 
 def top_down_frames(track: Track, trajectory: Trajectory, size: int = 256, tail: float = 1.0) -> np.ndarray:
-    """Draw a moving map: the drone from above, where its camera looks, and the last stretch of its path.
+    """Draw an animated map: the drone from above, its camera's direction, and the most recent part of its path.
 
     Args:
         track: the track.
         trajectory: a recorded episode of K steps.
         size: side of the square picture, pixels.
-        tail: duration of the stretch of path that is shown, s.
+        tail: duration of the path shown, s.
 
     Returns:
         (K + 1, size, size, 3) uint8.
@@ -235,19 +235,19 @@ def top_down_frames(track: Track, trajectory: Trajectory, size: int = 256, tail:
 
 
 def onboard_beside_map(track: Track, trajectory: Trajectory, size: int = 256, gap: int = 8) -> np.ndarray:
-    """Compose on-board view | moving map.
+    """Compose on-board view | animated map.
 
     Args:
         track: the track.
         trajectory: a recorded episode of K steps with square images.
-        size: least side of either picture, pixels: images are enlarged to it, or just beyond, by a whole factor.
-        gap: between them, pixels.
+        size: minimum side of each picture, pixels; images are enlarged to at least this by an integer factor.
+        gap: space between the pictures, pixels.
 
     Returns:
         (K + 1, side, 2 side + gap, 3) uint8.
 
     Raises:
-        ValueError: no images, or images that are not square.
+        ValueError: there are no images, or they are not square.
     """
     if trajectory.pixels is None:
         raise ValueError("the trajectory has no images: record it in an environment with from_pixels=True.")
@@ -261,7 +261,7 @@ def onboard_beside_map(track: Track, trajectory: Trajectory, size: int = 256, ga
 
 
 def _map_of(track: Track, size: int, positions: np.ndarray) -> tuple[Image.Image, np.ndarray]:
-    """Draw the empty map; return it, and where in it the positions (M, 2), m, are: (M, 2), pixels."""
+    """Draw the map of a track; return it with the pixel coordinates (M, 2) of the positions (M, 2) in m."""
     figure = Figure(figsize=(4.0, 4.0), dpi=size / 4.0)
     axes = figure.add_axes((0.0, 0.0, 1.0, 1.0))
     draw_track(axes, track, labels=False)
@@ -279,7 +279,7 @@ def _map_of(track: Track, size: int, positions: np.ndarray) -> tuple[Image.Image
 
 
 def _draw_drone(draw: ImageDraw.ImageDraw, place: np.ndarray, view: np.ndarray, size: float, color: str) -> None:
-    """Draw a dot with a wedge of 90°, the camera's field of view, towards the direction view (2,)."""
+    """Draw a dot, and a wedge of 90° (the camera's field of view) in the direction ``view`` (2,)."""
     if not np.isfinite(place).all():
         return
     x, y = place.tolist()
@@ -300,19 +300,19 @@ def _as_frames(frames: np.ndarray | torch.Tensor, name: str) -> np.ndarray:
 
 
 def _make_even(frame: np.ndarray) -> np.ndarray:
-    """Repeat the last row or column of (H, W, 3) where there is an odd number of them."""
+    """Pad (H, W, 3) to an even height and width by repeating the last row or column."""
     height, width, _ = frame.shape
     return np.pad(frame, ((0, height % 2), (0, width % 2), (0, 0)), mode="edge")
 
 
 def _shared_palette(frames: np.ndarray, colors: int) -> Image.Image:
-    """Choose the palette from up to 16 frames spread over all, one above the other."""
+    """Compute a common palette from up to 16 evenly spaced frames."""
     chosen = frames[np.linspace(0, len(frames) - 1, min(16, len(frames))).round().astype(int)]
     return Image.fromarray(chosen.reshape(-1, *chosen.shape[2:])).quantize(colors, method=Image.Quantize.MEDIANCUT)
 
 
 def shown_frames(dream: Dream, columns: int) -> list[int]:
-    """Choose frames to print: the last two of the context, then evenly to the end."""
+    """Choose frames to show: the last two of the context, then evenly spaced ones to the end."""
     last = dream.real.shape[1] - 1
     context = list(range(max(0, dream.context - 2), dream.context))
     rest = np.linspace(dream.context, last, max(1, columns - len(context))).round().astype(int)
@@ -320,15 +320,15 @@ def shown_frames(dream: Dream, columns: int) -> list[int]:
 
 
 def film_strip(dream: Dream, frames: Sequence[int], scale: int = 2, border: int = 3) -> np.ndarray:
-    """Put frames of the first window side by side: real above reconstructed above imagined.
+    """Compose frames of the first window side by side in three rows: real, reconstructed, imagined.
 
-    Borders of the lower two are green where the model has seen the image and orange where it imagines.
+    Borders of the lower two rows are green where the model has observed the image and orange where it predicts.
 
     Args:
-        dream: T frames.
-        frames: F indices of them.
-        scale: whole factor by which pixels are enlarged, without blurring.
-        border: its width, pixels.
+        dream: windows of T frames.
+        frames: F indices of frames.
+        scale: integer factor by which pixels are enlarged, without blurring.
+        border: width of the borders, pixels.
 
     Returns:
         (3 (scale H + 2 border), F (scale W + 2 border), 3) uint8.

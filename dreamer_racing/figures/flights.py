@@ -1,6 +1,6 @@
-"""Figures of what evaluations have stored: flights side by side, and what the world model sees and imagines.
+"""Figures of stored evaluations: flights side by side, and reconstructions and predictions of the world model.
 
-Each is drawn from files in `evaluations/`, without a simulator or a network.
+They are drawn from files in `evaluations/`, without a simulator or a network.
 Shapes: K control steps of an episode.
 """
 
@@ -34,12 +34,12 @@ from dreamer_racing.figures.drawing import (
 from dreamer_racing.figures.film import CONTEXT_COLOR, OPEN_LOOP_COLOR, film_strip, shown_frames
 from dreamer_racing.figures.profiles import PROFILE_AXES, altitude_legend, draw_altitude, draw_speed
 
-TITLE_ROOM = 0.35  # inches above the panels
-PROFILE_HEIGHT = 1.3  # inches of a profile below a map
+TITLE_ROOM = 0.35  # space above the panels, inches
+PROFILE_HEIGHT = 1.3  # height of a profile, inches
 
 
 class NamedFlight(NamedTuple):
-    """A recorded episode and what it is to be called."""
+    """A recorded episode with its title and track."""
 
     title: str
     track: Track
@@ -53,19 +53,19 @@ def plot_flights(
     columns: int = 3,
     problems: Sequence[str] = (),
 ) -> None:
-    """Draw flights from above, side by side on one scale, with the camera's direction; altitude and speed below.
+    """Draw flights from above side by side, at one scale, with the camera's direction; altitude and speed below.
 
     Reference: paper, Figs. "emergent" (with decoys and without) and "real world" (simulated and real).
 
     Args:
-        flights: which.
-        path: the file to write; missing folders are made.
+        flights: the flights.
+        path: the file to write; missing folders are created.
         over: axis of the profiles: ``distance`` flown (m) or ``time`` (s).
-        columns: flights in a row at most.
-        problems: what was left out, a line each.
+        columns: maximum number of flights in a row.
+        problems: lines for everything left out.
 
     Raises:
-        ValueError: no flights, or an unknown axis.
+        ValueError: there are no flights, or the axis is unknown.
     """
     if not flights:
         raise ValueError("no flights to draw.")
@@ -77,7 +77,7 @@ def plot_flights(
     top = 4.4 * half[1] / half[0]  # inches
     width, height = 4.6 * columns + 0.7, rows * (top + 2 * PROFILE_HEIGHT + 0.9) + 0.5 + TITLE_ROOM
     figure = Figure(figsize=(width, height))
-    # The layout forgets the titles of panels whose sides have a fixed proportion.
+    # The layout reserves no space for titles of panels with a fixed aspect ratio.
     figure.set_layout_engine(ConstrainedLayoutEngine(rect=(0, 0, 1, 1 - TITLE_ROOM / height)))
     grid = figure.add_gridspec(3 * rows, columns, height_ratios=[top, PROFILE_HEIGHT, PROFILE_HEIGHT] * rows)
     speed = speed_scale([flight.trajectory for flight in flights])
@@ -101,7 +101,7 @@ def plot_flights(
 def _draw_flight_and_profiles(
     panels: Sequence[Axes], flight: NamedFlight, speed: Normalize, half: Sequence[float], over: str
 ) -> None:
-    """Draw a map that shows so many metres to each side of the hall's middle; below it altitude and speed."""
+    """Draw a map that extends ``half`` (x, y), m, from the hall's middle to each side; below it altitude and speed."""
     axes, altitude, profile = panels
     draw_track(axes, flight.track)
     draw_flight(axes, flight.trajectory, speed)
@@ -115,7 +115,7 @@ def _draw_flight_and_profiles(
 
 
 def _hall(track: Track) -> tuple[float, float]:
-    """Width and depth, m."""
+    """Return width and depth of a track's bounding box, m."""
     (x_low, y_low, _), (x_high, y_high, _) = track.bounds_low, track.bounds_high
     return x_high - x_low, y_high - y_low
 
@@ -135,13 +135,13 @@ def plot_dreams(
     Reference: paper, Fig. "imagined".
 
     Args:
-        dreams: the stages, each with its name; the first window of each is shown.
-        path: the file to write; missing folders are made.
-        columns: points in time.
-        problems: what was left out, a line each.
+        dreams: the stages, each with its name; only the first window is shown.
+        path: the file to write; missing folders are created.
+        columns: number of frames per stage.
+        problems: lines for everything left out.
 
     Raises:
-        ValueError: no dreams.
+        ValueError: there are no dreams.
     """
     if not dreams:
         raise ValueError("no dreams to draw.")

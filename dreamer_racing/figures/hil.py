@@ -1,4 +1,4 @@
-"""The report on a flight in the loop: what came of it in numbers, and figures of it, beside its recording."""
+"""Report of a hardware-in-the-loop flight: metrics and figures, written to the folder of its recording."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ from dreamer_racing.hil.progress import GatePass
 
 REPORT, LATENCY, TRAJECTORY, TRACKING = "report.json", "report_latency.png", "report_flight.png", "report_tracking.png"
 SHORTEST = 0.01
-"""ms, as which a latency below it, or none at all, is drawn: the axis is logarithmic [choice]."""
+"""Smallest latency drawn, ms; shorter ones are drawn at this value, because the axis is logarithmic [choice]."""
 ASKED_COLOR, MEASURED_COLOR = INK, "#f2711c"
 LABELS = {
     "collective_thrust": "thrust (m/s²)",
@@ -42,20 +42,20 @@ LABELS = {
 
 
 def write_report(flight_path: Path, against: Path | None = None) -> list[str]:
-    """Write ``report.json`` and figures beside a recorded flight; those of an earlier report are replaced.
+    """Write ``report.json`` and figures into the folder of a recorded flight, replacing an earlier report.
 
     Reference: paper, Fig. "real world": trajectories with the camera's direction, and speed profiles.
 
     Args:
         flight_path: The recording, or its folder.
-        against: What to draw the flight beside: another recording, or the trajectory (CSV) of an evaluation.
+        against: Flight to compare with: another recording, or the trajectory (CSV) of an evaluation.
 
     Returns:
-        What came of the flight, in lines to print.
+        Lines of a summary to print.
 
     Raises:
-        FileNotFoundError: There is no such flight.
-        ValueError: One of them is damaged, empty, or no flight.
+        FileNotFoundError: A flight does not exist.
+        ValueError: A file is damaged or empty, or holds no flight.
     """
     flight = read_flown(flight_path)
     other = None if against is None else _read_other(against)
@@ -65,7 +65,7 @@ def write_report(flight_path: Path, against: Path | None = None) -> list[str]:
     own = trajectory_of(flight)
     report["problems"] += [] if own else ["it was armed for less than two ticks: there is no trajectory to draw"]
     for name in (LATENCY, TRAJECTORY, TRACKING, REPORT):
-        (folder / name).unlink(missing_ok=True)  # of an earlier report: none may stay that is not of this one
+        (folder / name).unlink(missing_ok=True)  # of an earlier report
     _draw_latencies(report["latency"], flight.about.get("rate"), folder / LATENCY)
     if own is not None:
         report["flown"] = _summary(own)
@@ -82,10 +82,10 @@ def write_report(flight_path: Path, against: Path | None = None) -> list[str]:
 
 
 def trajectory_of(flight: FlownFlight) -> Trajectory | None:
-    """Return the flight while it was armed, as evaluations store them; None if that is less than a step.
+    """Return the armed part of the flight as a trajectory; None if it is shorter than one step.
 
-    Rows are the poses that the flyer chose by, actions the commands in SI units. ``control_dt`` is the mean time
-    between ticks.
+    Rows are the poses that the flyer used, actions the commands in SI units. ``control_dt`` is the mean time between
+    ticks.
     """
     ticks = np.arange(len(flight.time))[flight.flown]
     ticks = ticks[np.isfinite(flight.seen[ticks]).all(axis=1)]
@@ -93,7 +93,7 @@ def trajectory_of(flight: FlownFlight) -> Trajectory | None:
     if not duration > 0.0:
         return None
     seen = torch.from_numpy(flight.seen[ticks]).float()
-    camera = (flight.about.get("contract") or {}).get("camera") or {}  # a pilot has none
+    camera = (flight.about.get("contract") or {}).get("camera") or {}  # no contract in manual flight
     return Trajectory(
         position=seen[:, :3],
         attitude=seen[:, 3:7],
@@ -108,7 +108,7 @@ def trajectory_of(flight: FlownFlight) -> Trajectory | None:
 
 
 def _read_other(path: Path) -> NamedFlight:
-    """Read what a flight is drawn beside."""
+    """Read the flight to compare with."""
     if path.suffix == ".csv":
         if not path.is_file():
             raise FileNotFoundError(f"against={path}: there is no such file.")
@@ -123,7 +123,7 @@ def _read_other(path: Path) -> NamedFlight:
 
 
 def _make_report(flight: FlownFlight, passes: list[GatePass], response: dict[str, Response]) -> dict[str, Any]:
-    """Return all numbers."""
+    """Return the content of report.json without figures and the flights' summaries."""
     config, ticks = flight.about.get("config") or {}, flight.time[flight.flown]
     began = float(ticks[0]) if len(ticks) else 0.0
     problems = [] if flight.whole else ["the file was not finished: the loop was killed, or it flies still"]
@@ -154,7 +154,7 @@ def _make_report(flight: FlownFlight, passes: list[GatePass], response: dict[str
 
 
 def _summary(trajectory: Trajectory) -> dict[str, float]:
-    """Return what a flight's figure shows, in numbers; rows that are not finite are left out."""
+    """Return summary statistics of a flight; non-finite rows are left out."""
     speed = trajectory.speed.numpy().astype(float)
     speed = speed[np.isfinite(speed)]
     steps = np.linalg.norm(np.diff(trajectory.position.numpy().astype(float), axis=0), axis=1)
@@ -193,7 +193,7 @@ def _draw_latencies(latency: dict[str, Any], rate: float | None, path: Path) -> 
 
 
 def _decades(values: Sequence[float]) -> tuple[float, float]:
-    """Return the powers of ten around positive values, so that none lies on the edge; one decade if there is none."""
+    """Return powers of ten as axis limits around positive values, with a margin; one decade around 1 if empty."""
     low, high = min(values, default=1.0), max(values, default=1.0)
     return 10.0 ** math.floor(math.log10(0.8 * low)), 10.0 ** math.ceil(math.log10(1.25 * high))
 
@@ -201,7 +201,7 @@ def _decades(values: Sequence[float]) -> tuple[float, float]:
 def _draw_tracking(
     response: dict[str, Response], errors: dict[str, dict[str, float | None] | None], began: float, path: Path
 ) -> None:
-    """Draw what was asked for and what was measured, over the time since arming."""
+    """Draw commands and measurements over the time since arming."""
     figure = Figure(figsize=(9.0, 1.75 * len(response) + 0.5), layout="constrained")
     panels = figure.subplots(len(response), 1, sharex=True, squeeze=False)[:, 0]
     for axes, (name, (asked_time, asked, time, measured)) in zip(panels, response.items(), strict=True):
@@ -225,7 +225,7 @@ def _error_in_words(name: str, error: dict[str, float | None] | None) -> str:
 
 
 def _lines(report: dict[str, Any]) -> list[str]:
-    """Say what came of a flight."""
+    """Return the lines of the summary."""
     lines = [
         f"{report['actor'] or 'flight'} on {report['track']}: armed for {report['armed_s']:.2f} s of "
         f"{report['duration_s']:.2f} s, ended: {report['ended']}",

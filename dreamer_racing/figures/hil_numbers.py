@@ -1,6 +1,6 @@
-"""What a recorded flight in the loop comes to in numbers: latencies, gates, and how the vehicle did as it was told.
+"""Metrics of a recorded hardware-in-the-loop flight: latencies, gate passes, and tracking errors of the commands.
 
-Shapes: T ticks of the loop, P poses as they were measured, M of either.
+Shapes: T ticks of the loop, P measured poses, M samples.
 """
 
 from __future__ import annotations
@@ -22,81 +22,81 @@ from dreamer_racing.hil.stamping import PoseClock, Stamping
 from dreamer_racing.hil.vehicle import Pose
 
 LAG_MAX = 0.3
-"""s, the largest lag from a command to the motion that it asks for that is tried [choice]."""
+"""Largest lag tried between a command and the measured motion, s [choice]."""
 
 LAG_STEP = 0.001
-"""s between the lags that are tried [choice]."""
+"""Step between the lags tried, s [choice]."""
 
 FEWEST = 20
-"""Measurements of which a lag may be said [choice]."""
+"""Minimum number of measurements for a tracking error [choice]."""
 
 ACCELERATION_WINDOW = 0.04
-"""s over which velocities are differenced for the thrust [choice]: two control steps at 50 Hz."""
+"""Window for the difference of velocities that gives the thrust, s [choice]: two control steps at 50 Hz."""
 
 STAGES = ("jitter", "render", "act", "sent")
-"""What a recording says of each tick: how late it began, and how long it took."""
+"""Recorded times of each tick: its delay, and the durations of its stages."""
 
 CHANNELS = {"collective_thrust": "m/s²", "body_rate_x": "rad/s", "body_rate_y": "rad/s", "body_rate_z": "rad/s"}
-"""Of a command, in its order, with their units."""
+"""Channels of a command in order, with their units."""
 
 
 @dataclass(frozen=True)
 class FlownFlight:
-    """A recorded flight in arrays."""
+    """Arrays of a recorded flight."""
 
     path: Path
-    """Of the file, or of its folder."""
+    """Path of the recording, or of its folder."""
     about: dict[str, Any]
-    """With what it was begun."""
+    """Metadata of the flight from the recording."""
     whole: bool
-    """Whether its file was finished."""
+    """Whether the recording is complete."""
     holds_track: bool
-    """Whether its file holds the track; if not, `track` is that of its name as it is now."""
+    """Whether the recording holds the track; if not, `track` is the current track of the recorded name."""
     track: Track
     limits: SafetyLimits
-    """Of safety; only those by which poses may be apart are read."""
+    """Safety limits; only those on the distance between poses are read from the recording."""
     time: np.ndarray
-    """(T,) s, by the loop's clock, when each tick began."""
+    """(T,) start of each tick on the loop's clock, s."""
     armed: np.ndarray
     """(T,) bool."""
     command: np.ndarray
-    """(T, 4) as sent: collective thrust in m/s² and body rates in rad/s."""
+    """(T, 4) commands sent: collective thrust in m/s² and body rates in rad/s."""
     seen: np.ndarray
-    """(T, 13) pose that each tick chose by: position, attitude wxyz, velocity, body rates; not-a-number if none."""
+    """(T, 13) pose used in each tick: position, attitude wxyz, velocity, body rates; NaN without a pose."""
     target_gate: np.ndarray
     """(T,) int."""
     passes: np.ndarray
-    """(T,) int: gates passed, as the loop counted."""
+    """(T,) int: the loop's count of gates passed."""
     took: dict[str, np.ndarray]
     """(T,) s each: ``jitter``, ``render``, ``act``, ``sent``."""
     overrun: np.ndarray
-    """(T,) int: deadlines that the tick before missed."""
+    """(T,) int: deadlines missed in the previous tick."""
     pose_age: np.ndarray
-    """(T,) s from the newest pose's measurement to the tick; not-a-number without a pose."""
+    """(T,) s from the newest pose's measurement to the tick; NaN without a pose."""
     poses: list[Pose]
-    """(P,) on the loop's clock."""
+    """(P,) poses with timestamps on the loop's clock."""
     arrived: np.ndarray
-    """(P,) int: the tick that took in each."""
+    """(P,) int: index of the tick that read each pose."""
     out_of_order: int
-    """Poses that came too late to count."""
+    """Number of poses that arrived out of order and were dropped."""
     ended: str | None
-    """How it ended, by safety; None if it was armed to the last tick, or never."""
+    """State and reasons with which the flight ended; None if it was armed until the last tick, or never."""
 
     @property
     def flown(self) -> slice:
-        """Ticks from the first armed one to the one after the last, which saw it end; none if it never was."""
+        """Ticks from the first armed one to the one after the last armed one; empty if never armed."""
         armed = np.flatnonzero(self.armed)
         return slice(armed[0], armed[-1] + 2) if len(armed) else slice(0, 0)
 
 
 class Response(NamedTuple):
-    """What was asked for and what came of it.
+    """Commands and measurements of one channel.
 
     Args:
-        asked_time: (T',) s, when each armed command was sent.
-        asked: (T',) which holds until the next.
-        time: (M,) s.
-        measured: (M,)
+        asked_time: (T',) time at which each armed command was sent, s.
+        asked: (T',) commands; each holds until the next.
+        time: (M,) times of the measurements, s.
+        measured: (M,) measurements.
     """
 
     asked_time: np.ndarray
@@ -106,11 +106,11 @@ class Response(NamedTuple):
 
 
 def read_flown(path: Path) -> FlownFlight:
-    """Read a flight.
+    """Read a recorded flight.
 
     Raises:
-        FileNotFoundError: There is none.
-        ValueError: It is damaged, empty, or of a track that there is not.
+        FileNotFoundError: The recording does not exist.
+        ValueError: The recording is damaged or empty, or its track does not exist.
     """
     flight = Flight(path)
     if not flight.ticks:
@@ -131,30 +131,30 @@ def read_flown(path: Path) -> FlownFlight:
 
 
 def _clock_of(config: dict[str, Any]) -> PoseClock:
-    """Return the clock that a flight's poses were stamped by."""
+    """Return the clock that converts the timestamps of a flight's poses."""
     drift = (config.get("limits") or {}).get("clock_drift_max")
     given = {} if drift is None else {"drift_max": float(drift)}
     return PoseClock(Stamping(config.get("stamping", "receive")), float(config.get("latency", 0.0)), **given)
 
 
 def _limits_of(config: dict[str, Any], track: Track) -> SafetyLimits:
-    """Return the limits of a flight by which two poses may be apart."""
+    """Return a flight's safety limits, with the recorded limits on the distance between poses."""
     set_then = config.get("limits") or {}
     names = [name for name in ("speed_max", "jump_tolerance") if set_then.get(name) is not None]
     return SafetyLimits.of_track(track, **{name: float(set_then[name]) for name in names})
 
 
 def latencies(flight: FlownFlight) -> dict[str, Any]:
-    """Return p50, p99 and maximum of each stage in ms, of armed ticks, or of all if there are none.
+    """Return p50, p99 and maximum of each stage in ms, over armed ticks, or over all ticks if none is armed.
 
     | stage | from | to |
     |---|---|---|
-    | ``jitter`` | when the tick was due | its beginning |
-    | ``interval`` | a tick's beginning | the next one's |
-    | ``pose_age`` | the newest pose's measurement, as stamped | the tick's beginning |
-    | ``render``, ``act`` | | durations of drawing the image and of the flyer |
-    | ``sent`` | the tick's beginning | the command is sent |
-    | ``end_to_end`` | the newest pose's measurement | the command is sent |
+    | ``jitter`` | scheduled start of the tick | start of the tick |
+    | ``interval`` | start of a tick | start of the next tick |
+    | ``pose_age`` | timestamp of the newest pose | start of the tick |
+    | ``render``, ``act`` | | durations of rendering and of the flyer |
+    | ``sent`` | start of the tick | the command is sent |
+    | ``end_to_end`` | timestamp of the newest pose | the command is sent |
     """
     armed = bool(flight.armed.any())
     ticks = flight.armed if armed else np.ones(len(flight.time), bool)
@@ -175,9 +175,9 @@ def latencies(flight: FlownFlight) -> dict[str, Any]:
 
 
 def gate_passes(flight: FlownFlight) -> list[GatePass]:
-    """Return the gates passed since it was armed, by the poses as measured."""
+    """Return the gates passed while armed, computed from all measured poses."""
     progress = GateProgress(flight.track, flight.limits)
-    newest = np.diff(flight.arrived, append=-1) != 0  # of their ticks
+    newest = np.diff(flight.arrived, append=-1) != 0  # whether a pose is its tick's newest
     for pose, tick, judged in zip(flight.poses, flight.arrived, newest, strict=True):
         if flight.flown.start <= tick < flight.flown.stop:
             progress.update(pose, judged=bool(judged))
@@ -185,10 +185,10 @@ def gate_passes(flight: FlownFlight) -> list[GatePass]:
 
 
 def lap_times(flight: FlownFlight, passes: list[GatePass]) -> dict[str, list[float]]:
-    """Return the times of laps, s, counted in two ways.
+    """Return lap times, s, counted in two ways.
 
-    ``flying``: from the first gate to the first gate. ``race``: from the last gate to the last gate, the first one from
-    arming; evaluations count so.
+    ``flying``: between passes of the first gate. ``race``, as in evaluations: between passes of the last gate; the
+    first lap begins at arming.
     """
     lasts = [passed.time for passed in passes if passed.gate == flight.track.num_gates - 1]
     began = [float(flight.time[flight.flown][0])] if lasts else []
@@ -196,10 +196,10 @@ def lap_times(flight: FlownFlight, passes: list[GatePass]) -> dict[str, list[flo
 
 
 def responses(flight: FlownFlight) -> dict[str, Response]:
-    """Return for each channel what was asked for while it was armed, and what was measured then.
+    """Return the commands and measurements of each channel while armed.
 
-    Thrust is not measured by poses; it is taken from their velocities: acceleration less gravity, along body z. Drag
-    along this axis is in it.
+    Thrust is estimated from the poses' velocities: acceleration minus gravity, along body z, which includes drag along
+    this axis.
     """
     armed = flight.armed
     if not armed.any():
@@ -221,11 +221,11 @@ def responses(flight: FlownFlight) -> dict[str, Response]:
 
 
 def tracking_error(response: Response) -> dict[str, float | None] | None:
-    """Return by how much the vehicle missed what it was told, at the lag at which it missed it least.
+    """Return the RMS tracking error of a channel at the lag that minimises it.
 
     Returns:
-        ``lag_ms``, in the middle where several are as good, None if the command never changed; ``rms`` at this lag and
-        ``rms_without_lag``, in the channel's unit. None if too little was measured.
+        ``lag_ms``, the median of equally good lags, None if the command never changed; ``rms`` at this lag and
+        ``rms_without_lag``, in the channel's unit. None if there are fewer than ``FEWEST`` measurements.
     """
     usable = response.time >= response.asked_time[0] + LAG_MAX
     time, measured = response.time[usable], response.measured[usable]
@@ -245,12 +245,12 @@ def _rms(values: np.ndarray) -> float:
 
 
 def _held(response: Response, time: np.ndarray) -> np.ndarray:
-    """Return the command that held at some times, (M,)."""
+    """Return the commands in force at times (M,), (M,)."""
     return response.asked[np.searchsorted(response.asked_time, time + 1e-9, side="right") - 1]
 
 
 def _measured_thrust(time: np.ndarray, poses: list[Pose]) -> tuple[np.ndarray, np.ndarray]:
-    """Return times (M,) and thrust divided by mass, less drag, (M,) m/s²."""
+    """Return times (M,) and the thrust minus drag divided by mass, (M,) m/s²."""
     half = 0.5 * ACCELERATION_WINDOW
     if not len(time) or time[-1] - time[0] <= ACCELERATION_WINDOW:
         return np.empty(0), np.empty(0)
@@ -266,7 +266,7 @@ def _measured_thrust(time: np.ndarray, poses: list[Pose]) -> tuple[np.ndarray, n
 
 
 def _read_ticks(ticks: list[dict[str, Any]], clock: PoseClock) -> dict[str, Any]:
-    """Return the fields of `FlownFlight` that are of ticks and poses."""
+    """Return the fields of `FlownFlight` about ticks and poses."""
     inputs, outputs = [read_inputs(tick["in"]) for tick in ticks], [tick["out"] for tick in ticks]
     commands = np.array([out["command"] for out in outputs], float).reshape(-1, 5)
     seen = [13 * [np.nan] if out["pose"] is None else out["pose"] for out in outputs]
@@ -293,7 +293,7 @@ def _read_ticks(ticks: list[dict[str, Any]], clock: PoseClock) -> dict[str, Any]
 
 
 def _stamp_poses(inputs: list[Inputs], clock: PoseClock) -> tuple[list[Pose], np.ndarray, np.ndarray]:
-    """Return poses on the loop's clock, the tick that took in each, and the newest one's age at each tick, s."""
+    """Return poses on the loop's clock, the tick that read each pose, and the newest pose's age at each tick, s."""
     poses: list[Pose] = []
     arrived, ages = [], []
     for tick, each in enumerate(inputs):
@@ -307,7 +307,7 @@ def _stamp_poses(inputs: list[Inputs], clock: PoseClock) -> tuple[list[Pose], np
 
 
 def _ending(outputs: list[dict[str, Any]], armed: np.ndarray) -> str | None:
-    """Return state and reasons of the first tick after the armed ones, in the words of safety."""
+    """Return the safety state and reasons of the first tick after the armed ones; None if there is none."""
     after = (np.flatnonzero(armed)[-1] + 1) if armed.any() else len(outputs)
     if after >= len(outputs):
         return None

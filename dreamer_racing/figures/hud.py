@@ -1,4 +1,4 @@
-"""Words on films: how far a race is, and what a world model has seen or only imagines.
+"""Captions of videos: progress of the race, and whether a world model observes or imagines.
 
 Shapes: T frames of H × W pixels, K control steps of an episode.
 """
@@ -17,20 +17,20 @@ from dreamer_racing.evaluation.dreams import Dream
 from dreamer_racing.evaluation.trajectory import Trajectory
 from dreamer_racing.figures.film import CONTEXT_COLOR, OPEN_LOOP_COLOR, side_by_side
 
-SHORTEST_FILM = 4.0  # s that a flight is stretched to last, so that one can follow it
-SLOWEST = 8  # times as long as the flight, at most
+SHORTEST_FILM = 4.0  # s; shorter flights are shown in slow motion, so that a viewer can follow them
+SLOWEST = 8  # maximum factor of slow motion
 STRIP_COLOR, WORDS_COLOR = (33, 37, 41), (255, 255, 255)
 LETTER_SIZES = range(16, 6, -1)  # pixels
-MARGIN = 5  # pixels left and right of words
+MARGIN = 5  # pixels left and right of the caption
 SEEN = "seen"
 
 
 def race_words(track: Track, trajectory: Trajectory) -> list[str]:
-    """Say time, speed, next gate and lap at every row of a flight, K + 1 lines.
+    """Return captions with time, speed, next gate and lap for each of the K + 1 rows of a flight.
 
     Args:
-        track: that is flown.
-        trajectory: from the start of an episode on; what `Trajectory.part` cuts out would count from its own beginning.
+        track: the track.
+        trajectory: a flight from the start of the episode; in a `Trajectory.part`, time and laps would start anew.
     """
     completed = laps_completed(trajectory).tolist()
     rows = zip(trajectory.speed.tolist(), trajectory.target_gate.tolist(), completed, strict=True)
@@ -42,9 +42,9 @@ def race_words(track: Track, trajectory: Trajectory) -> list[str]:
 
 
 def laps_completed(trajectory: Trajectory) -> np.ndarray:
-    """Count the laps behind a drone at every row of a flight from its start on, (K + 1,).
+    """Count the completed laps at every row of a flight from its start, (K + 1,).
 
-    A lap ends where the next gate is an earlier one: the first, or one behind it where a step passed two.
+    A lap ends where the index of the next gate decreases: to 0, or above 0 if one step passed two gates.
     """
     gate = trajectory.target_gate.numpy()
     return np.concatenate(([0], np.cumsum(gate[1:] < gate[:-1])))
@@ -55,36 +55,36 @@ def _speed(speed: float) -> str:
 
 
 def dream_words(frames: int, context: int, frame_dt: float, cycle: int | None = None) -> list[str]:
-    """Say of each frame whether the model has seen it, or for how long it has imagined.
+    """Return captions that say for each frame whether the model observes it, or how long it has imagined.
 
     Args:
         frames: T.
-        context: first frames that it sees.
-        frame_dt: s between two of them.
-        cycle: frames after which it sees again; None if never.
+        context: number of frames that the model observes first.
+        frame_dt: time between frames, s.
+        cycle: period in frames after which the context starts again; None for no repetition.
     """
     place = [frame % cycle if cycle else frame for frame in range(frames)]
     return [SEEN if at < context else f"imagined {(at - context + 1) * frame_dt:+.2f} s" for at in place]
 
 
 def slow_motion(seconds: float) -> int:
-    """Return by what whole factor to slow a flight of so many seconds down: those of the young are over at once."""
+    """Return the integer factor of slow motion for a flight's duration; flights of untrained policies are short."""
     return min(SLOWEST, max(1, math.ceil(SHORTEST_FILM / max(seconds, 1e-6))))
 
 
 def caption(frames: np.ndarray, left: Sequence[str], right: Sequence[str] = ()) -> np.ndarray:
-    """Put a strip with words above every frame; it covers none of the picture.
+    """Add a strip with a caption above every frame.
 
     Args:
-        frames: (T, H, W, 3) uint8, large enough to read words in.
-        left: a line each.
-        right: words above the right half, if any; green for what is seen, orange for what is imagined.
+        frames: (T, H, W, 3) uint8, large enough for legible text.
+        left: one caption per frame.
+        right: captions above the right half, if any; green if `SEEN`, else orange.
 
     Returns:
         (T, H + strip, W, 3) uint8.
 
     Raises:
-        ValueError: there are not as many lines as frames.
+        ValueError: the numbers of captions and frames differ.
     """
     if len(left) != len(frames) or (right and len(right) != len(frames)):
         raise ValueError(f"{len(frames)} frames need as many lines: there are {len(left)} and {len(right)}.")
@@ -105,11 +105,11 @@ def caption(frames: np.ndarray, left: Sequence[str], right: Sequence[str] = ()) 
 
 
 def dream_video(dreams: Sequence[tuple[str, Dream]], scale: int = 2) -> np.ndarray:
-    """Compose the stages of training under each other, each real | imagined under words, as long as the longest.
+    """Compose stages of training below each other, each as real | imagined; shorter ones hold their last frame.
 
     Args:
-        dreams: the stages, each with its name; their windows follow one another.
-        scale: whole factor by which pixels are enlarged, without blurring.
+        dreams: the stages, each with its name; the windows of a stage are shown one after another.
+        scale: integer factor by which pixels are enlarged, without blurring.
 
     Returns:
         (frames, height, width, 3) uint8.
@@ -121,7 +121,7 @@ def dream_video(dreams: Sequence[tuple[str, Dream]], scale: int = 2) -> np.ndarr
 
 
 def _fitting_font(line: str, room: int) -> ImageFont.FreeTypeFont:
-    """Choose the largest letters in which a line takes no more pixels than there are; the smallest if none does."""
+    """Return the largest font in which a line is at most ``room`` pixels wide, or the smallest if none is."""
     for size in LETTER_SIZES:
         font = cast(ImageFont.FreeTypeFont, ImageFont.load_default(size=size))
         if font.getlength(line) <= room:

@@ -1,4 +1,4 @@
-"""Figures of what training has logged: learning curves over seeds, and variants of an experiment side by side.
+"""Figures of training metrics: learning curves over seeds, and comparisons of an experiment's variants.
 
 Shapes: S seeds of a variant.
 """
@@ -30,39 +30,39 @@ ALGORITHMS = {
     "ppo": ("PPO", "#f76707"),
     "sac": ("SAC", "#e03131"),
 }
-"""Names and the paper's colours; another algorithm is drawn in grey under its own name."""
-TRACKS = ("circle", "kidney", "figure8")  # columns of the paper, in its order; others follow
+"""Display names and the paper's colours; other algorithms are grey with their own name."""
+TRACKS = ("circle", "kidney", "figure8")  # first columns, in the paper's order; others follow
 VARIANT_LINES: tuple[Any, ...] = ("-", (0, (4, 1.5)), (0, (1, 1)), (0, (5, 1.5, 1, 1.5)))
-VARIANT_SHADES = (0.0, -0.55, 0.5, -0.28)  # of an algorithm's colour: darker below 0, lighter above
-MANY_VARIANTS = 4  # of an algorithm: with more of them the reference is thick, the others thin and without a band
-SHORTEST_LINE = 0.03  # of an axis: what is shorter, because it was measured once say, is a dot
-LETTER = 0.072  # width of one in the legend, inches
+VARIANT_SHADES = (0.0, -0.55, 0.5, -0.28)  # change of an algorithm's colour: darker below 0, lighter above
+MANY_VARIANTS = 4  # above this number, all variants of an algorithm but the reference are thin and without a band
+SHORTEST_LINE = 0.03  # share of the axis; a shorter curve, such as one of a single measurement, is drawn as a dot
+LETTER = 0.072  # width of a letter in the legend, inches
 BANDS = {
     "mean": ("mean", "sample standard deviation (n − 1)"),
     "iqm": ("interquartile mean", "95 % bootstrap interval"),
 }
 DRAWN = ("gates", "evaluation_return")  # panels of the comparison
 Styles = dict[CurveKey, dict[str, Any]]
-COUNT_ROOM = 0.12  # of an axis: right of the longest bar, for its n
+COUNT_ROOM = 0.12  # space for n right of the longest bar, as a share of the axis
 SMALL: dict[str, Any] = {"fontsize": 8, "color": MUTED}
 ERROR: dict[str, Any] = {"ecolor": INK, "elinewidth": 1.4, "capsize": 3.0}
-REFERENCE_COLOR = "#1971c2"  # light enough for its error bar to be seen
-OTHER_COLOR = "#a5d8ff"  # of a variant that is not the reference
+REFERENCE_COLOR = "#1971c2"  # light, so that the error bar is visible
+OTHER_COLOR = "#a5d8ff"  # of other variants
 
 
 def plot_learning_curves(curves: LearningCurves, path: str | Path) -> None:
-    """Draw a column a track and a row a quantity, as the curves come; a colour an algorithm and a line style a variant.
+    """Draw a grid with a column per track and a row per quantity; colours are algorithms, line styles variants.
 
-    Ticks at the bottom are where the curriculum raised b₂, of every seed. What was left out is in a file beside it.
+    Ticks at the bottom mark where the curriculum raised b₂, for every seed. A text file names what was left out.
 
     Reference: paper, Fig. "Reward evolution".
 
     Args:
-        curves: what to draw.
-        path: the file to write; missing folders are made.
+        curves: the learning curves.
+        path: the file to write; missing folders are created.
 
     Raises:
-        ValueError: an algorithm has more variants than can be told apart.
+        ValueError: an algorithm has more variants than there are line styles.
     """
     tracks = _in_order({curve.key.track for curve in curves.curves} | {key.track for key in curves.raises}, TRACKS)
     quantities = list(dict.fromkeys(curve.quantity for curve in curves.curves))
@@ -85,7 +85,7 @@ def plot_learning_curves(curves: LearningCurves, path: str | Path) -> None:
                 axes.set_title(_track_title(track), fontsize=11, color=INK)
             shown = [curve for curve in curves.curves if curve.quantity == quantity and curve.key.track == track]
             if track == ALL_TRACKS and not shown:
-                axes.set_axis_off()  # the tracks have no common scale
+                axes.set_axis_off()  # not comparable across tracks
                 continue
             _draw_panel(axes, shown, styles, _end(curves, track))
             _draw_raises(axes, curves, track, styles)
@@ -104,7 +104,7 @@ def plot_learning_curves(curves: LearningCurves, path: str | Path) -> None:
 
 
 def _end(curves: LearningCurves, track: str) -> float:
-    """Return up to where on the axis there are values on a track, of any quantity: panels of a column share it."""
+    """Return the end of a track's axis, the last point with a value of any quantity; a column's panels share it."""
     own = [curve for curve in curves.curves if curve.key.track == track and curve.seeds.any()]
     return max((float(curve.x[curve.seeds > 0].max()) for curve in own), default=0.0) or 1.0
 
@@ -113,7 +113,7 @@ def _draw_panel(axes: Axes, curves: Sequence[Curve], styles: Styles, end: float)
     for curve in sorted(curves, key=lambda curve: _rank(curve.key), reverse=True):  # the reference on top
         line = styles[curve.key._replace(track="")]
         if curve.key.is_reference or not _crowded(curve.key, styles):
-            ends = (0.0, 1.0) if QUANTITIES[curve.quantity].comparable else (-np.inf, np.inf)  # a rate has no more
+            ends = (0.0, 1.0) if QUANTITIES[curve.quantity].comparable else (-np.inf, np.inf)  # rates are in [0, 1]
             band = (np.clip(side, *ends) for side in (curve.low, curve.high))
             axes.fill_between(curve.x, *band, color=line["color"], alpha=0.18, linewidth=0)
         axes.plot(curve.x, curve.centre, **line)
@@ -132,7 +132,7 @@ def _draw_panel(axes: Axes, curves: Sequence[Curve], styles: Styles, end: float)
 
 
 def _limits(quantity: str, limits: tuple[float, float]) -> tuple[float, float]:
-    """Return the ends of an axis: all of 0 to 1 for a rate, and from 0 to 1 at least for what is counted."""
+    """Return the limits of an axis: 0 to 1 for a rate, 0 to at least 1 for a count."""
     if QUANTITIES[quantity].comparable:
         return -0.02, 1.04
     if QUANTITIES[quantity].counted:
@@ -143,7 +143,7 @@ def _limits(quantity: str, limits: tuple[float, float]) -> tuple[float, float]:
 
 
 def _draw_raises(axes: Axes, curves: LearningCurves, track: str, styles: Styles) -> None:
-    """Draw a short tick for every rise of b₂, a level above the axis for each curve that has any."""
+    """Draw a short tick for every rise of b₂; each curve with rises has its own height above the axis."""
     raised = [key for key in styles if len(curves.raises.get(key._replace(track=track), ()))]
     for level, key in enumerate(raised):
         bottom = 0.012 + 0.05 * level
@@ -160,7 +160,7 @@ def _draw_raises(axes: Axes, curves: LearningCurves, track: str, styles: Styles)
 
 
 def _draw_legend(axes: Axes, handles: Sequence[Line2D], caption: str, columns: int) -> None:
-    """Fill the space below the panels."""
+    """Draw legend and caption below the panels."""
     axes.set_axis_off()
     style: dict[str, Any] = {"frameon": False, "fontsize": 9, "borderaxespad": 0.0, "labelcolor": INK}
     legend = axes.legend(handles=handles, loc="upper left", ncols=columns, title=caption, alignment="left", **style)
@@ -168,7 +168,7 @@ def _draw_legend(axes: Axes, handles: Sequence[Line2D], caption: str, columns: i
 
 
 def _caption(curves: LearningCurves, styles: Styles) -> str:
-    """Say what was aggregated how, and of what the band is drawn."""
+    """Return a caption that names the aggregate, the band and the window."""
     centre, band = BANDS[curves.aggregate]
     of = " of the default alone" if any(_crowded(key, styles) for key in styles) else ""
     window = f"{curves.window:.2g}"
@@ -179,7 +179,7 @@ def _caption(curves: LearningCurves, styles: Styles) -> str:
 
 
 def _seed_count(curves: LearningCurves, key: CurveKey) -> str:
-    """Say over how many seeds, and over how many at the end if they are fewer; by track if they differ."""
+    """Return the number of seeds as text, with the number at the end if it is smaller; by track if tracks differ."""
     counts: dict[str, tuple[int, int]] = {}
     for curve in curves.curves:
         track = curve.key.track
@@ -196,7 +196,7 @@ def _seed_count(curves: LearningCurves, key: CurveKey) -> str:
 
 
 def _seeds_at_the_end(curve: Curve) -> int:
-    """Count the seeds a little before the last value, since runs do not end with the same step."""
+    """Count the seeds slightly before the last value, because runs do not end at the same step."""
     end = ENDS_EARLY * curve.x[curve.seeds > 0].max(initial=0.0)
     return int(curve.seeds[np.searchsorted(curve.x, end, "right") - 1])
 
@@ -207,16 +207,16 @@ def _label(key: CurveKey) -> str:
 
 
 def line_styles(keys: Sequence[CurveKey]) -> Styles:
-    """Choose how to draw each curve: the algorithm's colour, darker or lighter, and dashes.
+    """Choose a distinct line style for each curve: the algorithm's colour, darker or lighter, and dashes.
 
     Args:
-        keys: in the order of the legend, without their tracks.
+        keys: keys without tracks, in the order of the legend.
 
     Returns:
-        Options of matplotlib's lines by key, all different.
+        Options of matplotlib's lines by key.
 
     Raises:
-        ValueError: an algorithm has more variants than can be told apart.
+        ValueError: an algorithm has more variants than there are line styles.
     """
     return {key: _line_style(key, [other for other in keys if other.algorithm == key.algorithm]) for key in keys}
 
@@ -230,7 +230,7 @@ def _line_style(key: CurveKey, own: Sequence[CurveKey]) -> dict[str, Any]:
         )
     index = own.index(key)
     color = np.array(to_rgb(ALGORITHMS.get(key.algorithm, ("", MUTED))[1]))
-    shade = VARIANT_SHADES[(index + index // lines) % shades]  # both differ as long as they can
+    shade = VARIANT_SHADES[(index + index // lines) % shades]  # shifted after each cycle of dashes
     mixed = color * (1 + shade) if shade < 0 else color + (1 - color) * shade
     thin = _crowded(key, own) and not key.is_reference
     return {"color": tuple(mixed), "linestyle": VARIANT_LINES[index % lines], "linewidth": 1.2 if thin else 1.9}
@@ -241,13 +241,13 @@ def _crowded(key: CurveKey, keys: Collection[CurveKey]) -> bool:
 
 
 def _rank(key: CurveKey) -> tuple[int, bool, CurveKey]:
-    """Sort by algorithm, the reference before the other variants."""
+    """Return a sort key: by algorithm, the reference before the other variants."""
     names = list(ALGORITHMS)
     return names.index(key.algorithm) if key.algorithm in names else len(names), not key.is_reference, key
 
 
 def _in_order(names: set[str], first: Sequence[str]) -> list[str]:
-    """Sort names: those that come first, the others by the alphabet, the pool of all at the end."""
+    """Sort names: first those in ``first``, then the others alphabetically, then `ALL_TRACKS`."""
     return sorted(
         names,
         key=lambda name: (name == ALL_TRACKS, name not in first, *([first.index(name)] if name in first else []), name),
@@ -259,13 +259,13 @@ def _track_title(track: str) -> str:
 
 
 def plot_comparison(comparison: Comparison, path: str | Path) -> None:
-    """Draw a bar a variant, its standard deviation over n seeds, and a dot a seed; the reference is a dashed line.
+    """Draw a bar per variant with the standard deviation over n seeds, a dot per seed, and a line at the reference.
 
-    Where values may be negative there is a diamond instead of the bar.
+    Quantities that may be negative have a diamond instead of the bar.
 
     Args:
-        comparison: what to draw.
-        path: the file to write; missing folders are made.
+        comparison: the comparison.
+        path: the file to write; missing folders are created.
     """
     results = comparison.results
     shown = [name for name in DRAWN if any(name in result.values for result in results)]
@@ -299,7 +299,7 @@ def _draw_bar(axes: Axes, place: int, result: VariantResult, name: str) -> None:
     color = REFERENCE_COLOR if result.key.is_reference else OTHER_COLOR
     if QUANTITIES[name].counted or QUANTITIES[name].comparable:
         axes.barh(place, values.mean(), xerr=error, color=color, error_kw=ERROR, height=0.65)
-    else:  # a bar from zero would make the worst of what is negative look the largest
+    else:  # with negative values, the worst variant would have the longest bar
         axes.errorbar(values.mean(), place, xerr=error, fmt="D", markersize=8, color=color, **ERROR)
     axes.plot(values, np.full(len(values), place), "o", color="white", markeredgecolor=INK, markersize=4, clip_on=False)
     right = max(values.max(), values.mean() + (error or 0.0))

@@ -1,7 +1,7 @@
-"""Loggers beside `metrics.csv`: TorchRL's own, that also take a run's configuration, pictures and films.
+"""TensorBoard and Weights & Biases loggers: TorchRL's own, extended to log a run's configuration, images and videos.
 
-Each is a `torchrl.record.loggers.Logger` and a `training.media.MediaLogger`; `make_loggers` chooses them by name.
-Nothing leaves the machine unless ``wandb="online"``.
+Each is a `torchrl.record.loggers.Logger` and a `training.media.MediaLogger`; `make_loggers` creates them from the
+configuration. No data leaves the machine unless ``wandb="online"``.
 """
 
 from __future__ import annotations
@@ -26,14 +26,14 @@ from dreamer_racing.figures.film import write_gif
 from dreamer_racing.settings import NOT_NEGATIVE, setting
 from dreamer_racing.training.directory import RunDirectory
 
-GIF_FRAMES = 100  # of a film in TensorBoard, at most
-GIF_WIDTH = 320  # pixels, at most
+GIF_FRAMES = 100  # maximum, of a video in TensorBoard
+GIF_WIDTH = 320  # maximum, pixels
 OUTCOMES = ("evaluation/success_rate", "evaluation/gates_per_episode", "evaluation/return_mean", "episode/return")
 """Metrics by which TensorBoard's table of hyperparameters compares runs."""
 
 
 class Wandb(Enum):
-    """Where what Weights & Biases gets goes."""
+    """Mode of Weights & Biases."""
 
     none = "none"
     offline = "offline"
@@ -42,19 +42,19 @@ class Wandb(Enum):
 
 @dataclass
 class LoggerConfig:
-    """Where metrics go besides metrics.csv."""
+    """Settings of the loggers besides metrics.csv."""
 
     tensorboard: bool = True
-    wandb: Wandb = Wandb.none  # Weights & Biases; online alone sends anything
-    project: str = "dreamer_racing"  # of W&B
-    media: bool = True  # whether TensorBoard and W&B get plots and films of evaluations
+    wandb: Wandb = Wandb.none  # Weights & Biases; only online sends data
+    project: str = "dreamer_racing"  # name of the W&B project
+    media: bool = True  # whether to log plots and videos of evaluations to TensorBoard and W&B
     every: int = setting(2_000, NOT_NEGATIVE)  # env_steps between rows
 
     def check(self) -> None:
-        """Refuse W&B where it is not installed.
+        """Check that W&B is installed if it is configured.
 
         Raises:
-            ValueError: so it is.
+            ValueError: it is not installed.
         """
         if self.wandb is not Wandb.none and importlib.util.find_spec("wandb") is None:
             raise ValueError(
@@ -67,12 +67,12 @@ def make_loggers(run_dir: str | Path, config: LoggerConfig, resume_env_steps: in
     """Make the loggers of a run.
 
     Args:
-        run_dir: of the run; whatever is written lies in it, in ``tensorboard`` and in ``wandb``.
-        config: says which.
-        resume_env_steps: those of the checkpoint this run continues; None if it is new.
+        run_dir: the run directory; loggers write to its folders ``tensorboard`` and ``wandb``.
+        config: settings of the loggers.
+        resume_env_steps: env_steps of the checkpoint that the run resumes from; None for a new run.
 
     Raises:
-        ValueError: W&B is not installed.
+        ValueError: W&B is configured but not installed.
     """
     config.check()
     loggers: list[RunLogger] = [TensorboardRunLogger(run_dir, resume_env_steps)] if config.tensorboard else []
@@ -83,11 +83,11 @@ def make_loggers(run_dir: str | Path, config: LoggerConfig, resume_env_steps: in
 
 
 class TensorboardRunLogger(TensorboardLogger):
-    """TensorBoard files of a run; what they hold beyond a run's resumption is not shown any more.
+    """TensorBoard files of a run; on resumption, entries after the checkpoint are purged.
 
     Args:
-        run_dir: of the run.
-        resume_env_steps: those of the checkpoint this run continues; None if it is new.
+        run_dir: the run directory.
+        resume_env_steps: env_steps of the checkpoint that the run resumes from; None for a new run.
     """
 
     def __init__(self, run_dir: str | Path, resume_env_steps: int | None = None) -> None:
@@ -99,29 +99,29 @@ class TensorboardRunLogger(TensorboardLogger):
         return SummaryWriter(log_dir=str(Path(self.log_dir) / self.exp_name), purge_step=purge_step)
 
     def renew(self) -> None:
-        """Go on in another file, after a write that failed: what comes behind it in this one is not read."""
+        """Continue in a new file after a failed write, because TensorBoard reads nothing behind it in the old one."""
         self.experiment: Any = SummaryWriter(log_dir=self.log_dir)
 
     def log_configuration(self, settings: Mapping[str, Any], text: str) -> None:
-        """Show the configuration as text, and the settings in the table of hyperparameters."""
+        """Log the configuration as text, and the settings to the table of hyperparameters."""
         self.experiment.add_text("configuration", f"```yaml\n{text}\n```", self._resume_env_steps or 0)
         self.log_hparams(dict(settings))
 
     def log_hparams(self, cfg: Any) -> None:
-        """Enter the settings of this run; `SummaryWriter.add_hparams` would make a run of its own of each start."""
+        """Log the settings of this run; `SummaryWriter.add_hparams` would create a separate run at each start."""
         from torch.utils.tensorboard.summary import hparams
 
-        plain = (int, float, str)  # of a bool, TensorBoard would make a number
+        plain = (int, float, str)  # not bool, which TensorBoard would show as a number
         known = {name: value if type(value) in plain else json.dumps(value, default=str) for name, value in cfg.items()}
         for summary in hparams(known, dict.fromkeys(OUTCOMES, 0.0)):
             self.experiment.file_writer.add_summary(summary)
 
     def log_picture(self, name: str, file: Path, env_steps: int) -> None:
-        """Show a PNG file as it is."""
+        """Log a PNG file unchanged."""
         self._log_encoded(name, file.read_bytes(), env_steps)
 
     def log_film(self, name: str, file: Path, env_steps: int) -> None:
-        """Show a film as a GIF, of no more frames and pixels than one looks at."""
+        """Log a video as a GIF, reduced to `GIF_FRAMES` and `GIF_WIDTH`."""
         frames, fps = read_film(file, GIF_FRAMES, GIF_WIDTH)
         gif = file.with_name(f".{file.stem}.gif")
         write_gif(gif, frames, fps)
@@ -141,10 +141,10 @@ class WandbRunLogger(WandbLogger):
     """A run of Weights & Biases, which a resumed run continues.
 
     Args:
-        run_dir: of the run; its files and its id lie in ``run_dir/wandb``.
-        project: of W&B.
-        offline: whether nothing goes to the server; `wandb sync` sends it later.
-        resumed: whether the run continues: then it has the id that it began with, if it had one.
+        run_dir: the run directory; files and id of the W&B run are in ``run_dir/wandb``.
+        project: the W&B project.
+        offline: whether to send nothing to the server; `wandb sync` sends it later.
+        resumed: whether the run is resumed, and so keeps its W&B id if it has one.
     """
 
     def __init__(self, run_dir: str | Path, project: str, offline: bool, resumed: bool = False) -> None:
@@ -163,17 +163,17 @@ class WandbRunLogger(WandbLogger):
         )
 
     def log_configuration(self, settings: Mapping[str, Any], text: str) -> None:
-        """Take the settings."""
+        """Log the settings."""
         self.log_hparams(dict(settings))
 
     def log_picture(self, name: str, file: Path, env_steps: int) -> None:
-        """Take a PNG file as it is."""
+        """Log a PNG file."""
         import wandb
 
         self.log_metrics({name: wandb.Image(str(file))}, step=env_steps)
 
     def log_film(self, name: str, file: Path, env_steps: int) -> None:
-        """Take an mp4 file as it is."""
+        """Log an mp4 file."""
         import wandb
 
         self.log_metrics({name: wandb.Video(str(file), format="mp4")}, step=env_steps)
@@ -183,15 +183,15 @@ RunLogger = TensorboardRunLogger | WandbRunLogger
 
 
 def read_film(file: Path, max_frames: int, max_width: int) -> tuple[np.ndarray, float]:
-    """Read a film, leaving out frames and pixels.
+    """Read a video, subsampled in time and space.
 
     Args:
-        file: mp4.
-        max_frames: T at most: every second is kept, or every third, and so on.
-        max_width: pixels at most, likewise.
+        file: mp4 file.
+        max_frames: maximum of T, reached by keeping every second frame, every third, and so on.
+        max_width: maximum of W in pixels, reached in the same way.
 
     Returns:
-        (T, H, W, 3) uint8, and the frames per second at which it plays as fast as the film.
+        (T, H, W, 3) uint8, and the frames per second that preserve the video's speed.
     """
     reader: Any = imageio.get_reader(file, format="FFMPEG")
     with reader:

@@ -1,4 +1,4 @@
-"""Figures of what runs have stored: what `recipes/plot.py` draws, and an experiment at its end."""
+"""Figures of stored runs, for `recipes/plot.py` and for the end of an experiment."""
 
 import logging
 import re
@@ -39,7 +39,7 @@ from dreamer_racing.training.directory import RunDirectory, ensure_writable
 
 
 class Aggregate(Enum):
-    """What stands for the seeds of a learning curve."""
+    """Aggregate of a learning curve over seeds."""
 
     mean = "mean"
     iqm = "iqm"
@@ -47,43 +47,43 @@ class Aggregate(Enum):
 
 @dataclass
 class PlotConfig:
-    """`recipes/plot.py`."""
+    """Settings of `recipes/plot.py`."""
 
-    # run directory, folder of some, table metrics*.csv, pattern or list [a,b]; or a learning_curves.csv, or its folder
+    # run directory, folder of runs, table metrics*.csv, pattern or list [a,b]; or a learning_curves.csv or its folder
     runs: Any = "runs"
     figure: str = "all"  # learning_curves | imagined | trajectories | comparison | all
-    output: str = "figures"  # folder
-    quantities: Any = field(default_factory=lambda: ["return"])  # rows, one or a list: dreamer_racing/figures/curves.py
+    output: str = "figures"  # output folder
+    quantities: Any = field(default_factory=lambda: ["return"])  # name or list, see dreamer_racing/figures/curves.py
     aggregate: Aggregate = Aggregate.mean  # mean (and standard deviation) | iqm (and 95 % bootstrap interval)
-    axis: str = "env_steps"  # of the curves: env_steps | hours (wall clock) | core_hours (CPU time)
-    # of the curves' running mean, in units of their axis; null: 2 % of the longest run
+    axis: str = "env_steps"  # axis of the curves: env_steps | hours (wall clock) | core_hours (CPU time)
+    # window of the curves' running mean, in units of their axis; null: 2 % of the longest run
     window: float | None = setting(None, NOT_NEGATIVE)
-    flights: Any = field(default_factory=list)  # file *_trajectory.csv or a list; empty: of each curve the first seed's
-    flight: str = "last"  # of the evaluations of a run: last | best (by gates, then return)
+    flights: Any = field(default_factory=list)  # file *_trajectory.csv or a list; empty: one of each curve's first seed
+    flight: str = "last"  # which evaluation of a run to draw: last | best (by gates, then return)
     over: str = "distance"  # axis of the speed profile: distance | time
-    dreams: Any = field(default_factory=list)  # file *_dream.npz or a list; empty: a run's first, middle and last
+    dreams: Any = field(default_factory=list)  # file *_dream.npz or a list; empty: first, middle and last of a run
 
 
 logger = logging.getLogger(__name__)
 
-VIDEO_SLOWER = 2  # than the flight, so that one can look
-FLIGHTS = ("last", "best")  # of the evaluations of a run
+VIDEO_SLOWER = 2  # slow-motion factor of videos
+FLIGHTS = ("last", "best")  # values of the setting `flight`
 
 
 class Drawn(NamedTuple):
-    """What became of a figure."""
+    """Result of drawing a figure."""
 
     files: list[str]
-    """Names, in the output folder; none if nothing is stored for it."""
+    """Names in the output folder; empty if the runs have no data for the figure."""
     problems: list[str]
-    """What was left out, a line each."""
+    """A line for everything left out."""
 
 
 def draw(config: PlotConfig) -> None:
-    """Make one figure, or all for which there is something to draw; of flights or dreams by name alone, theirs.
+    """Draw one figure, or all figures with data; if only flight or dream files are given, only their figures.
 
     Raises:
-        ValueError: bad setting, the figure asked for cannot be drawn, or none of all.
+        ValueError: a setting is invalid, or the requested figure, or none of all figures, can be drawn.
     """
     lists = {name: as_list(getattr(config, name)) for name in ("quantities", "flights", "dreams")}
     config = replace(config, **lists)  # type: ignore[arg-type]
@@ -109,15 +109,15 @@ def draw(config: PlotConfig) -> None:
 
 
 def as_list(value: Any) -> list[str]:
-    """Take a single path for a list of one."""
+    """Return a value as a list of strings: a single value as one entry, an empty one as no entry."""
     return [str(one) for one in (value if isinstance(value, list) else [value] if value else [])]
 
 
 def refuse_for_curves(config: PlotConfig) -> None:
-    """Refuse, with a file of curves, what only runs can be drawn with.
+    """Check that no setting is given that cannot be combined with a file of curves.
 
     Raises:
-        ValueError: the message names the setting.
+        ValueError: there is such a setting; the message names it.
     """
     names = ("quantities", "axis", "aggregate", "window", "flights", "dreams")
     given = [name for name in names if getattr(config, name) != getattr(PlotConfig(), name)]
@@ -131,10 +131,10 @@ def refuse_for_curves(config: PlotConfig) -> None:
 
 
 def check_plot(config: PlotConfig) -> None:
-    """Refuse what no figure can be drawn with.
+    """Check the settings.
 
     Raises:
-        ValueError: the value of a setting is not one of those there are.
+        ValueError: a value is not allowed, or a file does not exist.
     """
     check_settings(config)
     for name, value, allowed in (
@@ -151,11 +151,11 @@ def check_plot(config: PlotConfig) -> None:
 
 
 def draw_all(config: PlotConfig, output: Path, runs: list[RunData], problems: list[str], names: Iterable[str]) -> None:
-    """Make every figure for which there is something to draw; one that fails does not cost the others.
+    """Draw every figure that has data; if one fails, the others are still drawn.
 
     Raises:
         ValueError: nothing could be drawn.
-        Exception: of the first figure that failed for a reason that the runs cannot have, after the others were drawn.
+        Exception: the first exception other than ValueError and OSError, after the other figures were drawn.
     """
     drawn = False
     failures: dict[str, Exception] = {}
@@ -174,7 +174,7 @@ def draw_all(config: PlotConfig, output: Path, runs: list[RunData], problems: li
 
 
 def draw_one(name: str, config: PlotConfig, output: Path, runs: list[RunData], problems: list[str]) -> bool:
-    """Make a figure and say what it has left out; return whether there was anything to draw."""
+    """Draw a figure and log what it has left out; return whether there was data."""
     files, found = FIGURES[name].draw(config, output, runs, problems)
     warn([problem for problem in found if problem not in problems])
     logger.info("%-17s %s", f"{name}:", ", ".join(files) or "none of these runs has stored anything for it")
@@ -182,13 +182,13 @@ def draw_one(name: str, config: PlotConfig, output: Path, runs: list[RunData], p
 
 
 def warn(problems: list[str]) -> None:
-    """Say a line each."""
+    """Log each problem as a warning."""
     for problem in problems:
         logger.warning("warning: %s", problem)
 
 
 def draw_learning_curves(config: PlotConfig, output: Path, runs: list[RunData], problems: list[str]) -> Drawn:
-    """Make `learning_curves.png` and `.csv`."""
+    """Write `learning_curves.png` and `.csv`."""
     curves = learning_curves(runs, config.quantities, config.aggregate.value, config.window, problems, config.axis)
     write_curves(output / CURVES, curves)
     draw_curves(curves, output)
@@ -196,12 +196,12 @@ def draw_learning_curves(config: PlotConfig, output: Path, runs: list[RunData], 
 
 
 def draw_curves(curves: LearningCurves, output: Path) -> None:
-    """Make `learning_curves.png`."""
+    """Write `learning_curves.png`."""
     plot_learning_curves(curves, output / "learning_curves.png")
 
 
 def draw_imagined(config: PlotConfig, output: Path, runs: list[RunData], problems: list[str]) -> Drawn:
-    """Make a grid, a video and a small GIF of three stages of training of each curve's first seed that has dreams."""
+    """Write a grid, a video and a GIF of three stages of training, for the first seed of each curve with dreams."""
     if config.dreams:
         return draw_dreams("imagined", {Path(file): Dream.load(file) for file in config.dreams}, [], output)
     files, missing, names = [], [], Counter[str]()
@@ -209,28 +209,28 @@ def draw_imagined(config: PlotConfig, output: Path, runs: list[RunData], problem
         stages, left_out = stages_of_training(run)
         missing += left_out
         if stages:
-            names[run.name] += 1  # runs of two experiments may be called alike
+            names[run.name] += 1  # runs of two experiments may have the same name
             name = f"imagined_{run.name}" + (f"_{names[run.name]}" if names[run.name] > 1 else "")
             files += draw_dreams(name, stages, left_out, output).files
     return Drawn(files, missing)
 
 
 def stages_of_training(run: RunData) -> tuple[dict[Path, Dream], list[str]]:
-    """Read the first, the middle and the last dream of a run; instead of one that cannot be read the one before it.
+    """Read the first, the middle and the last dream of a run; an unreadable one is replaced by the one before it.
 
     Returns:
-        The dreams, each once, by file, and what was left out.
+        The dreams by file, without duplicates, and a line for everything left out.
     """
     files = evaluation_files(run.directory, "_dream.npz")
     files = [file for file in files if file.name.partition("_")[0].isdigit()] or files  # of training, if there are any
     problems: list[str] = []
-    choices = (files, files[len(files) // 2 :: -1], files[::-1])  # before the first there is none: the one after it
+    choices = (files, files[len(files) // 2 :: -1], files[::-1])  # the first one is replaced by the one after it
     found = [first_readable(choice, Dream.load, problems) for choice in choices]
     return dict(sorted(filter(None, found), key=lambda pair: files.index(pair[0]))), problems
 
 
 def draw_dreams(name: str, stages: dict[Path, Dream], problems: list[str], output: Path) -> Drawn:
-    """Make a grid, a video and a small GIF."""
+    """Write a grid, a video and a GIF of dreams."""
     dreams = [(stage_name(file), dream) for file, dream in stages.items()]
     plot_dreams(dreams, output / f"{name}.png", problems=problems)
     fps, film = 1 / (VIDEO_SLOWER * dreams[0][1].frame_dt), dream_video(dreams)
@@ -240,7 +240,7 @@ def draw_dreams(name: str, stages: dict[Path, Dream], problems: list[str], outpu
 
 
 def draw_trajectories(config: PlotConfig, output: Path, runs: list[RunData], problems: list[str]) -> Drawn:
-    """Make `trajectories.png` of the files named, or of one evaluation of each curve's first seed."""
+    """Write `trajectories.png` of the given files, or of one evaluation of each curve's first seed."""
     missing: list[str] = []
     flights = [named_flight(file) for file in config.flights] or chosen_flights(runs, config.flight, missing)
     if not flights:
@@ -250,10 +250,10 @@ def draw_trajectories(config: PlotConfig, output: Path, runs: list[RunData], pro
 
 
 def chosen_flights(runs: list[RunData], which: str, problems: list[str]) -> list[NamedFlight]:
-    """Read the last or the best flight of the first seed of each curve; of those that cannot be read, the next one.
+    """Read the last or the best flight of the first seed of each curve, or the next one if it cannot be read.
 
     Args:
-        runs: of any curves.
+        runs: runs of any curves.
         which: ``last`` or ``best``.
         problems: gets a line for every file that cannot be read.
     """
@@ -265,7 +265,7 @@ def chosen_flights(runs: list[RunData], which: str, problems: list[str]) -> list
 
 
 def stored_flights(run: RunData, which: str) -> list[Path]:
-    """List the flights of a run, the last or the best first."""
+    """Return the flight files of a run, sorted from the last or the best on."""
     files = evaluation_files(run.directory, "_trajectory.csv")[:: -1 if which == "last" else 1]
     if which == "best":
         files.sort(key=lambda file: evaluation_score(file, "_trajectory.csv"), reverse=True)
@@ -273,13 +273,13 @@ def stored_flights(run: RunData, which: str) -> list[Path]:
 
 
 def named_flight(file: str | Path) -> NamedFlight:
-    """Read a flight with its track; the run's and the evaluation's names are its title."""
+    """Read a flight with its track; its title is made of the names of the run and the evaluation."""
     trajectory, track = read_trajectory(file)
     return NamedFlight(f"{run_of(file).name}, {stage_name(file)}", track, trajectory)
 
 
 def run_of(file: str | Path) -> Path:
-    """Return the folder whose name says who flew: a run's, also of what an evaluation left in it, or a flight's."""
+    """Return the run directory of an evaluation's file, or for a file outside a run its folder."""
     folder = Path(file).absolute().parent
     if folder.name == RunDirectory(folder).evaluations.name:
         folder = folder.parent
@@ -287,13 +287,13 @@ def run_of(file: str | Path) -> Path:
 
 
 def stage_name(file: str | Path) -> str:
-    """Say after how many env_steps an evaluation was made, if its file does."""
+    """Return the env_steps of an evaluation as text, if its file is named by them, else the file's name as words."""
     name = Path(file).stem.rpartition("_")[0]
     return f"{int(name):,} env_steps" if name.isdigit() else name.replace("_", " ")
 
 
 def draw_comparison(config: PlotConfig, output: Path, runs: list[RunData], problems: list[str]) -> Drawn:
-    """Make `comparison.md` and `comparison.png`, if there are variants to compare."""
+    """Write `comparison.md` and `comparison.png`, if there are variants to compare."""
     if len(group_runs(runs)) < 2:
         if runs and config.figure == "comparison":
             raise ValueError("figure=comparison: these runs are of one variant; runs= takes several paths.")
@@ -305,17 +305,17 @@ def draw_comparison(config: PlotConfig, output: Path, runs: list[RunData], probl
 
 
 def no_columns(config: PlotConfig) -> Iterable[str]:
-    """Of a figure that is drawn from other files."""
+    """Return no columns, for figures that do not use `metrics.csv`."""
     return ()
 
 
 class Entry(NamedTuple):
-    """How `figure=` makes a figure, and from what of `metrics.csv`."""
+    """A figure of the setting `figure`: its function and the columns that it needs."""
 
     draw: Callable[[PlotConfig, Path, list[RunData], list[str]], Drawn]
-    """Of the configuration, the output folder, the runs read, and what of them was left out, a line each."""
+    """Function of the configuration, the output folder, the runs, and the lines for what was left out of them."""
     columns: Callable[[PlotConfig], Iterable[str]]
-    """Those that it looks for in a run's `metrics.columns`; no others are read."""
+    """Returns the columns of `metrics.csv` to read."""
 
 
 FIGURES = {

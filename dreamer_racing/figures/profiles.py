@@ -1,4 +1,4 @@
-"""Speed and altitude along a flight: what a map from above cannot show. A drone above a gate is not through it.
+"""Profiles of speed and altitude along a flight; on a map, a drone above a gate looks as if it passed the gate.
 
 Shapes: K control steps of an episode.
 """
@@ -21,23 +21,23 @@ from dreamer_racing.figures.drawing import CRASH, FAINT, GATE_COLOR, MUTED, SPEE
 
 PROFILE_AXES = {"distance": "distance flown (m)", "time": "time (s)"}
 FRAME: dict[str, Any] = {"linewidth": 3.5, "solid_capstyle": "butt", "zorder": 2}
-MISSED_COLOR = "#adb5bd"  # of a gate that was crossed on the map, and not passed
+MISSED_COLOR = "#adb5bd"  # of a gate that was crossed on the map but not passed
 HEADROOM = 0.3  # m above the highest thing drawn
 
 
 class Crossing(NamedTuple):
-    """Where a flight, seen from above, crosses the bar of a race gate."""
+    """A crossing of a race gate's bar by a flight, seen from above."""
 
     row: float
-    """Of the trajectory, between two rows: 0.5 is halfway from the first to the second."""
+    """Fractional row of the trajectory: 0.5 is halfway between the first two rows."""
     gate: int
-    """Its index on the track."""
+    """Index of the gate on the track."""
     passed: bool
-    """Whether the race counted it: through the opening, in its turn, forwards."""
+    """Whether the race counted a pass: through the opening, in order, forwards."""
 
 
 def crossings(track: Track, trajectory: Trajectory) -> list[Crossing]:
-    """Find where a flight crosses the gates' bars on the map, at any height, in the order of flight."""
+    """Return the crossings of a flight with the gates' bars on the map, at any height, in temporal order."""
     found = []
     target = trajectory.target_gate.numpy()
     for index, gate in enumerate(track.gates):
@@ -47,7 +47,7 @@ def crossings(track: Track, trajectory: Trajectory) -> list[Crossing]:
 
 
 def _rows_of_crossing(gate: Gate, reach: float, position: np.ndarray) -> list[float]:
-    """Find between which rows of (K + 1, 3) a gate's plane is crossed, within its reach to either side, m."""
+    """Return the fractional rows of (K + 1, 3) that cross a gate's plane within ``reach`` m to either side."""
     offset = position[:, :2] - np.array(gate.position[:2])
     along, side = offset @ np.array(gate.forward[:2]), offset @ np.array(gate.left[:2])  # (K + 1,)
     steps = np.flatnonzero((along[:-1] < 0) != (along[1:] < 0))
@@ -57,7 +57,7 @@ def _rows_of_crossing(gate: Gate, reach: float, position: np.ndarray) -> list[fl
 
 
 def profile_axis(trajectory: Trajectory, over: str) -> np.ndarray:
-    """Where the rows of a trajectory lie on the axis of a profile, (K + 1,), m or s.
+    """Return the positions of a trajectory's rows on the axis of a profile, (K + 1,), m or s.
 
     Args:
         trajectory: the flight.
@@ -70,13 +70,13 @@ def profile_axis(trajectory: Trajectory, over: str) -> np.ndarray:
 
 
 def draw_speed(axes: Axes, trajectory: Trajectory, speed: Normalize, over: str = "distance") -> None:
-    """Draw the speed, coloured by itself, and a numbered line at every gate passed.
+    """Draw the speed, coloured by speed, and a numbered line at every gate pass.
 
     Args:
-        axes: where.
+        axes: axes to draw on.
         trajectory: the flight.
-        speed: scale of the colours, and of the axis.
-        over: the other axis: ``distance`` flown (m) or ``time`` (s).
+        speed: scale of the colours and of the vertical axis.
+        over: horizontal axis: ``distance`` flown (m) or ``time`` (s).
     """
     along = profile_axis(trajectory, over)
     _draw_profile(axes, trajectory, along, trajectory.speed.numpy(), speed)
@@ -87,17 +87,17 @@ def draw_speed(axes: Axes, trajectory: Trajectory, speed: Normalize, over: str =
 def draw_altitude(
     axes: Axes, track: Track, trajectory: Trajectory, speed: Normalize, over: str = "distance", numbers: bool = True
 ) -> None:
-    """Draw the altitude, coloured by speed, and the frame of every gate where the map shows its bar crossed.
+    """Draw the altitude, coloured by speed, and a gate's frame at every crossing of its bar on the map.
 
-    The gap of a frame is the opening. Frames of gates that did not count are grey.
+    The gap in a frame is the opening. Frames of crossings that did not count as a pass are grey.
 
     Args:
-        axes: where.
-        track: whose gates.
+        axes: axes to draw on.
+        track: the track with the gates.
         trajectory: the flight.
-        speed: scale of the colours.
-        over: the other axis: ``distance`` flown (m) or ``time`` (s).
-        numbers: whether gates passed are numbered above.
+        speed: colour scale.
+        over: horizontal axis: ``distance`` flown (m) or ``time`` (s).
+        numbers: whether to number gate passes above the axes.
     """
     along = profile_axis(trajectory, over)
     height = trajectory.position[:, 2].numpy()
@@ -114,7 +114,7 @@ def draw_altitude(
 
 
 def altitude_legend(flights: Sequence[tuple[Track, Trajectory]]) -> list[Line2D]:
-    """Make the entries of the legend that profiles of altitude need beside `flight_legend`."""
+    """Return the legend entries of altitude profiles, in addition to `flight_legend`."""
     passed = {crossing.passed for flight in flights for crossing in crossings(*flight)}
     handles = []
     if True in passed:
@@ -140,7 +140,7 @@ def _draw_frame(axes: Axes, track: Track, index: int, place: float, passed: bool
 
 
 def _draw_profile(axes: Axes, trajectory: Trajectory, along: np.ndarray, values: np.ndarray, speed: Normalize) -> None:
-    """Draw values (K + 1,) along a flight, coloured by speed, and a crash at their end."""
+    """Draw values (K + 1,) along a flight, coloured by speed, and a crash at the end."""
     points = np.stack((along, values), axis=1)
     lines = LineCollection(list(np.stack((points[:-1], points[1:]), axis=1)), cmap=SPEED_COLORS, norm=speed)
     lines.set(array=trajectory.speed[1:].numpy(), linewidth=2.2, capstyle="round", zorder=4)
@@ -153,7 +153,7 @@ def _draw_profile(axes: Axes, trajectory: Trajectory, along: np.ndarray, values:
 
 
 def _number_passes(axes: Axes, trajectory: Trajectory, along: np.ndarray) -> None:
-    """Draw a numbered line at every gate passed."""
+    """Draw a numbered line at every gate pass."""
     for row in np.flatnonzero(np.diff(trajectory.target_gate)):
         place, number = along[row + 1], str(int(trajectory.target_gate[row]) + 1)
         axes.axvline(place, color=FAINT, linewidth=0.8, linestyle=(0, (2, 2)), zorder=1)

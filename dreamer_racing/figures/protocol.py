@@ -1,4 +1,4 @@
-"""Pictures of the evaluation protocol and of the perception report: PNG, PDF or SVG by the path's suffix."""
+"""Figures of the evaluation protocol and of the perception report, as PNG, PDF or SVG by the path's suffix."""
 
 from __future__ import annotations
 
@@ -34,12 +34,12 @@ MODE_COLORS = {"deterministic": "#6f9be0", "stochastic": "#f2b705"}
 CAUSE_COLORS = dict(
     zip(CRASHES, ("#e8590c", "#c2255c", "#7950f2", "#1fa2a6", "#495057", "#adb5bd", "#a0522d"), strict=True)
 )
-Z95 = 1.96  # standard deviations to either side of which 95 % of a normal distribution lie
+Z95 = 1.96  # half-width of the central 95 % of a normal distribution, in standard deviations
 SIGHT_COLORS = ("#6f9be0", "#7bc043", "#c2255c")
 
 
 class Bar(NamedTuple):
-    """A mean, its 95 % interval, and over how many samples: of a single one a mean has no interval but itself."""
+    """A mean, its 95 % interval, and the number of samples; with one sample the interval has zero width."""
 
     height: float
     low: float
@@ -48,22 +48,22 @@ class Bar(NamedTuple):
 
 
 def share_bar(happened: Sequence[bool]) -> Bar:
-    """Return the share of what happened with Wilson's interval, which does not shrink to nothing at 0 and 1.
+    """Return the share of true values with Wilson's interval, which keeps a positive width at shares of 0 and 1.
 
     Reference: Wilson, Probable inference, the law of succession, and statistical inference, 1927.
     """
-    import scipy.stats  # a second, which training does without
+    import scipy.stats  # takes a second; not needed in training
 
     low, high = scipy.stats.binomtest(sum(happened), len(happened)).proportion_ci(0.95, "wilson")
     return Bar(float(np.mean(happened)), float(low), float(high), len(happened))
 
 
 def mean_bar(values: Sequence[float], height: float | None = None) -> Bar:
-    """Return the mean of what is never negative with the normal interval of a mean.
+    """Return the mean of non-negative values with its normal interval.
 
     Args:
         values: independent samples.
-        height: of the bar, if it is not just their mean: of samples of different length, say.
+        height: height of the bar; None for the mean. A mean over samples of different length may need another.
     """
     n, mean = len(values), float(np.mean(values)) if height is None else height
     half = Z95 * float(np.std(values, ddof=1)) / np.sqrt(n) if n > 1 else 0.0
@@ -71,12 +71,12 @@ def mean_bar(values: Sequence[float], height: float | None = None) -> Bar:
 
 
 def plot_conditions(results: Sequence[Result], path: str | Path, title: str | None = None) -> None:
-    """Draw success and gates per episode of each condition, a bar for each mode of the policy.
+    """Draw success rate and gates per episode of each condition, with one bar per mode of the policy.
 
     Args:
-        results: of the protocol.
-        path: the file to write; missing folders are made.
-        title: above the picture.
+        results: results of the protocol.
+        path: the file to write; missing folders are created.
+        title: title of the figure.
     """
     places = list(dict.fromkeys((result.preset, result.condition) for result in results))
     figure = Figure(figsize=(max(9.0, 1.2 * len(places)), 6.4), layout="constrained")
@@ -108,17 +108,17 @@ def _gates(evaluation: Evaluation) -> Bar:
 
 
 def _distinct(evaluation: Evaluation) -> list[Episode]:
-    """Leave out repetitions: where nothing is drawn at random, every episode of a track is the same flight."""
+    """Return the distinct episodes; without randomness, all episodes on a track are the same flight."""
     return list({repr(episode): episode for episode in evaluation.episodes}.values())
 
 
 def plot_crashes(flown: Mapping[str, Evaluation], path: str | Path, title: str | None = None) -> None:
-    """Draw on the way to which gate episodes crashed, and by which cause: a panel for each evaluation.
+    """Draw the number of crashes by next gate and cause, with one panel per evaluation.
 
     Args:
         flown: evaluations by name, on tracks with the same number of gates.
-        path: the file to write; missing folders are made.
-        title: above the picture.
+        path: the file to write; missing folders are created.
+        title: title of the figure.
     """
     figure = Figure(figsize=(9.0, 3.4), layout="constrained")
     panels = figure.subplots(1, len(flown), sharey=True, squeeze=False)[0]
@@ -151,13 +151,13 @@ def plot_sight(
     path: str | Path,
     title: str | None = None,
 ) -> None:
-    """Draw where the camera looked: flights from above, distributions of angles, and shares of time in view.
+    """Draw where the camera pointed: flights from above, distributions of angles, and shares of time in view.
 
     Args:
-        flights: by name (``without decoys``), on tracks of one size: the track, one flight, and the sights of all.
+        flights: track, one flight, and the sights over all flights, by name (``without decoys``); tracks have one size.
         camera: the nose camera.
-        path: the file to write; missing folders are made.
-        title: above the picture.
+        path: the file to write; missing folders are created.
+        title: title of the figure.
     """
     columns, track = len(flights), next(iter(flights.values()))[0]
     width, depth = (high - low for low, high in zip(track.bounds_low[:2], track.bounds_high[:2], strict=True))
@@ -202,7 +202,7 @@ def _draw_maps(
 
 def _draw_distributions(axes: Axes, name: str, sights: Mapping[str, Sight], camera: Camera) -> None:
     edges = np.arange(0, 180 + BIN_DEGREES, BIN_DEGREES)
-    single = {thing for thing in sights if thing.startswith("decoy ") or is_race_gate(thing)}  # any is enough
+    single = {thing for thing in sights if thing.startswith("decoy ") or is_race_gate(thing)}  # left out
     drawn = {thing: sight for thing, sight in sights.items() if thing not in single}
     for color, (thing, sight) in zip(SIGHT_COLORS, drawn.items(), strict=False):
         axes.stairs(sight.histogram().numpy(), edges, color=color, label=thing, linewidth=1.6, fill=False)
@@ -232,7 +232,7 @@ def _draw_shares(axes: Axes, flights: Mapping[str, Mapping[str, Sight]]) -> None
 
 
 def _share_axis(axes: Axes) -> None:
-    """Let the axis go from 0 to 1, and leave room above for what is written on the bars."""
+    """Set the axis to shares from 0 to 1, with room above for the bars' labels."""
     axes.set_ylim(0.0, 1.35)
     axes.set_yticks([0.0, 0.25, 0.5, 0.75, 1.0])
     axes.yaxis.set_major_formatter(PercentFormatter(1.0))
@@ -247,7 +247,7 @@ def _draw_bars(
     width: float = 0.4,
     form: str = "{:.2g}",
 ) -> None:
-    """Draw bars with their intervals, and value and n above."""
+    """Draw bars with their intervals, and write value and n above."""
     heights = np.array([bar.height for bar in bars])
     ends = np.array([(bar.height - bar.low, bar.high - bar.height) for bar in bars]).clip(0.0).T  # (2, M)
     style: dict[str, Any] = {"ecolor": INK, "elinewidth": 1.2, "capsize": 2.5}

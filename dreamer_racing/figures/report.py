@@ -1,4 +1,4 @@
-"""What an evaluation leaves to look at: numbers, a plot of the flight, and the world model's dream beside it.
+"""Reports of evaluations: numbers, a plot of the flight, and a video with the world model's predictions.
 
 Shapes: K control steps of a recorded episode.
 """
@@ -25,20 +25,20 @@ from dreamer_racing.learners.learner import Evaluable
 from dreamer_racing.learners.update import WorldModelLearner
 from dreamer_racing.training.directory import RunDirectory
 
-SEEN_STEPS, DREAMT_STEPS = 10, 40  # control steps the model sees, then predicts on its own, in the video
+SEEN_STEPS, DREAMT_STEPS = 10, 40  # control steps observed by the model, then predicted open loop, in the video
 
 
 class EvaluationReport:
-    """Evaluates a learner's policy and writes plot, video and numbers into its run directory.
+    """Evaluates a learner's policy and writes numbers, plot and video into the run directory.
 
     Args:
-        directory: of the run; files go to its `plots`, `videos` and `evaluations` folders.
-        learner: whose policy flies, and whose world model dreams if it has one.
+        directory: the run directory; files go to its `plots`, `videos` and `evaluations` folders.
+        learner: the learner with the policy and, if any, the world model.
         worlds: arguments of `DroneRacingEnv`: track, preset, renderer, camera.
-        episodes: episodes of an evaluation.
-        video_steps: control steps K that the video shows at most.
-        num_envs: as of `Course`.
-        seed: of the evaluation's environment, anew at each evaluation: all meet the same starts and drones.
+        episodes: number of episodes per evaluation.
+        video_steps: maximum control steps K in the video.
+        num_envs: see `Course`.
+        seed: seed of the environment, set before each evaluation, so that all have the same starts and drones.
     """
 
     def __init__(
@@ -60,10 +60,10 @@ class EvaluationReport:
         self._course = Course(learner.evaluation_policy(), {**worlds, "seed": seed}, episodes, num_envs)
 
     def make(self, env_steps: int, stochastic: bool = False) -> dict[str, float]:
-        """Evaluate the deterministic policy, and the stochastic one too if asked; write everything.
+        """Evaluate the deterministic policy, and optionally the stochastic one; write all files.
 
         Returns:
-            Metrics `evaluation/...`, and `evaluation_stochastic/...` if asked.
+            Metrics `evaluation/...`, and `evaluation_stochastic/...` if ``stochastic``.
         """
         metrics = self._one(f"{env_steps:09d}", "evaluation", deterministic=True)
         if stochastic:
@@ -78,15 +78,15 @@ class EvaluationReport:
         return {f"{prefix}/{key}": float(value) for key, value in numbers.items()}
 
     def evaluate(self, deterministic: bool) -> Evaluation:
-        """Fly the episodes."""
+        """Run the episodes."""
         value_function = self._learner.value_function()
         return self._course.evaluate(deterministic, value_function=value_function, on_episode=self.on_episode)
 
     def write(self, name: str, result: Evaluation) -> None:
-        """Write `evaluations/<name>.json`, `plots/<name>.png` and, of an agent that sees, `videos/<name>.mp4`.
+        """Write `evaluations/<name>.json`, `plots/<name>.png` and, with images, `videos/<name>.mp4`.
 
-        Beside the numbers, figures of later find the flight in `<name>_trajectory.csv` and, of an agent that sees,
-        `<name>_onboard.npz`; of one that imagines images, `<name>_dream.npz`.
+        For later figures, also write `evaluations/<name>_trajectory.csv`, with images `<name>_onboard.npz`, and with a
+        world model that predicts images `<name>_dream.npz`.
         """
         into = self.directory
         for folder in (into.evaluations, into.plots, into.videos):
@@ -105,7 +105,7 @@ class EvaluationReport:
         self._film(into.videos / f"{name}.mp4", trajectory, painter)
 
     def _film(self, path: Path, trajectory: Trajectory, painter: Painter | None) -> None:
-        """Write the flight, beside what the world model makes of it if there is a painter; slowly if it is short."""
+        """Write a video of the flight, with a painter also of the model's predictions; short flights in slow motion."""
         assert trajectory.pixels is not None
         count = min(len(trajectory.pixels), self.video_steps)
         if painter is None or not isinstance(self._learner, WorldModelLearner):
@@ -119,20 +119,20 @@ class EvaluationReport:
         write_video(path, caption(frames, left, right), fps=1 / (slower * trajectory.control_dt), scale=1)
 
     def close(self) -> None:
-        """Free the evaluation's simulator."""
+        """Close the evaluation's simulator."""
         self._course.close()
 
 
 class ReturnReport:
-    """Evaluates a learner's policy in any environment by its returns, and films one episode.
+    """Evaluates a learner's policy in any environment by its returns, and records a video of one episode.
 
     Args:
-        directory: of the run; files go to its `videos` and `evaluations` folders.
-        learner: whose policy acts.
-        env: batch size [N], with `pixels` or `vector`.
-        episodes: episodes of an evaluation, assigned to the N worlds beforehand.
-        video_steps: steps that the video shows at most.
-        seed: of the environment, anew at each evaluation: all meet the same starts, also in a run that was resumed.
+        directory: the run directory; files go to its `videos` and `evaluations` folders.
+        learner: the learner with the policy.
+        env: environment of batch size [N], with `pixels` or `vector`.
+        episodes: number of episodes per evaluation, assigned to the N environments beforehand.
+        video_steps: maximum number of steps in the video.
+        seed: seed of the environment, set before each evaluation: all have the same starts, even after resuming.
     """
 
     def __init__(
@@ -155,10 +155,10 @@ class ReturnReport:
         self._seed = seed
 
     def make(self, env_steps: int, stochastic: bool = False) -> dict[str, float]:
-        """Evaluate the deterministic policy, and the stochastic one too if asked; write everything.
+        """Evaluate the deterministic policy, and optionally the stochastic one; write all files.
 
         Returns:
-            Metrics `evaluation/...`, and `evaluation_stochastic/...` if asked.
+            Metrics `evaluation/...`, and `evaluation_stochastic/...` if ``stochastic``.
         """
         metrics: dict[str, float] = {}
         for suffix in ("", "_stochastic") if stochastic else ("",):
@@ -177,10 +177,10 @@ class ReturnReport:
 
     @torch.no_grad()
     def _act(self) -> tuple[Tensor, Tensor, list[Tensor]]:
-        """Return the episodes' returns and lengths ``(episodes,)`` and the images of world 0's first episode."""
+        """Return the episodes' returns and lengths ``(episodes,)`` and the images of environment 0's first episode."""
         num_envs = self._env.batch_size[0]
         left = torch.tensor(split_episodes(self.episodes, num_envs))
-        total, length = torch.zeros(num_envs), torch.zeros(num_envs)  # (N,) of the episodes under way
+        total, length = torch.zeros(num_envs), torch.zeros(num_envs)  # (N,) of the current episodes
         returns, lengths, frames, filming = [], [], [], True
         self._env.set_seed(self._seed)
         tensordict = self._env.reset()
@@ -208,18 +208,18 @@ class ReturnReport:
             write_video(into.videos / f"{name}.mp4", torch.stack(frames), fps=30)
 
     def close(self) -> None:
-        """Free the evaluation's simulators."""
+        """Close the evaluation's environments."""
         self._env.close(raise_if_closed=False)
 
 
 def dream_beside_flight(learner: WorldModelLearner, trajectory: Trajectory, painter: Painter, max_steps: int) -> Tensor:
-    """Show the on-board view beside the world model's prediction, again and again: some context, then open loop.
+    """Compose the on-board view and the world model's prediction, alternating between context and open loop.
 
     Args:
-        learner: whose world model dreams.
+        learner: the learner with the world model.
         trajectory: a recorded episode with images.
-        painter: what shows its latents.
-        max_steps: K at most.
+        painter: function from latents to images.
+        max_steps: maximum of K.
 
     Returns:
         uint8 frames (K, height, width, 3).

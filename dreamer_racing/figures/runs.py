@@ -1,4 +1,4 @@
-"""Runs on disk: finding their folders, reading what a figure needs, and putting those together that belong together."""
+"""Runs on disk: finding their folders, reading their metrics, and grouping them by curve."""
 
 from __future__ import annotations
 
@@ -21,31 +21,31 @@ from dreamer_racing.training.clock import CPU_CLOCK, WALL_CLOCK
 from dreamer_racing.training.directory import RunDirectory
 from dreamer_racing.training.metrics import MetricsTable, read_metrics
 
-DEFAULT_ALGORITHM = "dreamer_v3"  # of configurations from before there was a choice
+DEFAULT_ALGORITHM = "dreamer_v3"  # for configurations without `algorithm`
 PPO_ACTORS = ("flown_ppo", "latent_ppo", "asymmetric_ppo")
-"""Values of loss.actor of what is the algorithm latent_ppo, in runs from before it had its name."""
+"""Values of loss.actor in older runs of the algorithm now named latent_ppo."""
 LOGGED_BY = (
     ("imagined_reward", "dreamer_v3"), ("loss_dynamics", "latent_ppo"), ("alpha", "sac"), ("clip_fraction", "ppo"),
 )  # fmt: skip
-"""Columns of `metrics.csv` that one algorithm alone has, or none before it in this order."""
-REFERENCE = "default"  # the variant that others are compared with; so is one without a name
+"""Columns of `metrics.csv` that identify the algorithm: the first one that exists decides."""
+REFERENCE = "default"  # name of the variant that others are compared with, as is a variant without a name
 SAME_CURVE = (
     "seed", "run_dir", "resume", "total_env_steps", "device", "logger.", "checkpoint.", "replay.storage",
     "replay.device", "evaluation.every", "evaluation.first", "evaluation.stochastic", "evaluation.video_steps",
     "model.cuda_graph",
 )  # fmt: skip
-"""Settings, or beginnings of them, in which the runs of one curve may differ: none of them changes what is learned."""
-IN_KEY = ("algorithm", "track", "task")  # settings that every key names anyway
+"""Names or prefixes of settings in which the runs of one curve may differ, because they do not affect learning."""
+IN_KEY = ("algorithm", "track", "task")  # settings that every key contains
 
 
 class Axis(NamedTuple):
-    """Along what curves are drawn and runs compared."""
+    """The axis along which curves are drawn and runs compared."""
 
     label: str
     clock: str | None
-    """Column of `metrics.csv`, s since the run began, that hours are read off; None: env_steps."""
+    """Column of `metrics.csv` with the clock in s since the run began; None for the axis env_steps."""
     form: str
-    """Of numbers on it."""
+    """Format of numbers on the axis."""
     smallest_window: float
 
 
@@ -57,10 +57,10 @@ AXES = {
 
 
 def axis_of(name: str) -> Axis:
-    """Look up an axis.
+    """Return the axis of a name.
 
     Raises:
-        ValueError: there is none of that name.
+        ValueError: the name is unknown.
     """
     if name not in AXES:
         raise ValueError(f"axis={name}: there are {', '.join(AXES)}.")
@@ -68,32 +68,32 @@ def axis_of(name: str) -> Axis:
 
 
 class CurveKey(NamedTuple):
-    """What the runs of one curve have in common."""
+    """Key that the runs of one curve share."""
 
-    track: str  # or the task, of the Control Suite
+    track: str  # or the task of the Control Suite
     algorithm: str
     variant: str
-    """Named by the run folder, ``<algorithm>_<track>_<variant>_seed<k>``, and by what `group_runs` adds; or empty."""
+    """From the run folder's name ``<algorithm>_<track>_<variant>_seed<k>``, extended by `group_runs`; may be empty."""
 
     @property
     def is_reference(self) -> bool:
-        """Whether the other variants are compared with this one."""
+        """Whether this is the variant that others are compared with."""
         return self.variant in ("", REFERENCE)
 
     def __str__(self) -> str:
-        """Say it in words."""
+        """Return the non-empty parts, separated by spaces."""
         return " ".join(filter(None, (self.algorithm, self.track, self.variant)))
 
 
 @dataclass(frozen=True)
 class RunData:
-    """A run directory, read.
+    """Content of a run directory, or of a metrics table that was kept without one.
 
     Args:
-        directory: of the run; or the file, of a table of metrics that was kept alone.
-        config: settings of `config.yaml` by dotted name; empty of a table alone.
-        metrics: its `metrics.csv`.
-        overrides: what its command line set, by dotted name, as text; empty if that was not stored.
+        directory: the run directory, or the file of the metrics table.
+        config: settings of `config.yaml` by dotted name; empty for a metrics table.
+        metrics: content of `metrics.csv`.
+        overrides: settings of the command line as text, by dotted name; empty if they were not stored.
     """
 
     directory: Path
@@ -103,12 +103,12 @@ class RunData:
 
     @property
     def name(self) -> str:
-        """Of the folder."""
+        """Name of the folder or file."""
         return self.directory.name
 
     @property
     def seed(self) -> int:
-        """Of the run, or as the name of a table says."""
+        """Seed of the run, or for a metrics table the seed in its name."""
         if "seed" in self.config:
             return int(self.config["seed"])
         named = re.search(r"_seed(\d+)", self.directory.stem)
@@ -116,7 +116,7 @@ class RunData:
 
     @property
     def key(self) -> CurveKey:
-        """Which curve the run belongs to, by its folder's name; `group_runs` looks at the settings, too."""
+        """Key of the run's curve by its configuration and folder name; `group_runs` also compares settings."""
         if not self.config:
             return _key_of_table(self.directory)
         algorithm = str(self.config.get("algorithm", DEFAULT_ALGORITHM))
@@ -129,12 +129,12 @@ class RunData:
 
 
 def is_metrics(path: Path) -> bool:
-    """Whether a file is a table of metrics by its name: `metrics.csv`, or `metrics_<what>.csv` as results keep them."""
+    """Return whether a path is a metrics table: an existing file `metrics.csv` or `metrics_<name>.csv`."""
     return re.fullmatch(r"metrics(_.+)?\.csv", path.name) is not None and path.is_file()
 
 
 def _key_of_table(path: Path) -> CurveKey:
-    """Read off the name `metrics_<track>_<variant>_seed<k>.csv` what it says, and off its columns who learned."""
+    """Return the key of a metrics table `metrics_<track>_<variant>_seed<k>.csv`, with the algorithm by its columns."""
     words = re.sub(r"^metrics_?|(?:^|_)seed\d+", "", path.stem)
     track = next(
         (name for name in sorted(BUILTIN_TRACKS, key=len, reverse=True) if re.search(rf"(?:^|_){name}(?:_|$)", words)),
@@ -149,16 +149,16 @@ def _key_of_table(path: Path) -> CurveKey:
 
 
 def find_runs(places: Sequence[str | Path]) -> list[Path]:
-    """Find run directories: folders with a `config.yaml` or a `metrics.csv`; and tables `metrics_<what>.csv`.
+    """Find run directories (folders with `config.yaml` or `metrics.csv`) and metrics tables `metrics_<name>.csv`.
 
     Args:
-        places: run directories, tables, folders that hold some at any depth, or patterns with `*` of either.
+        places: run directories, tables, folders that contain them at any depth, or glob patterns of these.
 
     Returns:
-        The folders and tables, sorted, each once; what lies inside of a run (`best`, `evaluation`) is no run.
+        The folders and tables, sorted, without duplicates. Folders inside a run (`best`, `evaluation`) are no runs.
 
     Raises:
-        ValueError: there is none in one of the places.
+        ValueError: one of the places has no run.
     """
     found = set()
     for place in places:
@@ -174,7 +174,7 @@ def find_runs(places: Sequence[str | Path]) -> list[Path]:
 
 
 def runs_below(folder: Path) -> Iterator[Path]:
-    """Walk through the run directories and tables of a folder, at any depth."""
+    """Yield the run directories and metrics tables below a folder, at any depth."""
     if is_metrics(folder):
         yield folder
     for path, folders, files in os.walk(folder):
@@ -187,14 +187,14 @@ def runs_below(folder: Path) -> Iterator[Path]:
 
 
 def read_runs(directories: Sequence[Path], wanted: Collection[str] | None = None) -> tuple[list[RunData], list[str]]:
-    """Read runs, leaving out those that cannot be read, and of repeated ones all but the one that got furthest.
+    """Read runs without unreadable ones; of runs with the same settings and seed, keep the one with most env_steps.
 
     Args:
-        directories: of the runs.
+        directories: run directories and metrics tables.
         wanted: names of the columns of `metrics.csv` to read; None for all.
 
     Returns:
-        The runs, and for everything left out a line that names the run and the reason.
+        The runs, and a line with run and reason for everything left out.
     """
     runs, problems = [], []
     for directory in directories:
@@ -216,7 +216,7 @@ def read_runs(directories: Sequence[Path], wanted: Collection[str] | None = None
 
 
 def _once_each(runs: Sequence[RunData], problems: list[str]) -> list[RunData]:
-    """Keep one run of each seed of each curve: a second one is no second sample."""
+    """Keep one run per seed of each curve, because a repetition is not an independent sample."""
     kept = []
     for group in _by_curve(runs).values():
         for _, repeated in groupby(group, key=lambda run: run.seed):
@@ -238,13 +238,13 @@ def _read_config(directory: Path) -> dict[str, Any]:
     if not isinstance(config, dict):
         raise ValueError(f"{path} holds no settings")
     flat = dict(flatten(config))
-    if described := flat.get("track_description"):  # long; it need only tell one track from another
+    if described := flat.get("track_description"):  # long; a hash suffices to compare tracks
         flat["track_description"] = hashlib.sha256(str(described).encode()).hexdigest()[:8]
     return flat
 
 
 def _read_overrides(directory: Path) -> dict[str, str]:
-    """Read what the command line set; it only names curves, so that a run without it is as good."""
+    """Read the settings of the command line; they only name curves, so that they may be missing."""
     try:
         told = yaml.safe_load(RunDirectory(directory).overrides.read_text(encoding="utf-8"))
     except (OSError, yaml.YAMLError, UnicodeDecodeError):
@@ -263,14 +263,14 @@ def flatten(config: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, 
 
 
 def group_runs(runs: Sequence[RunData]) -> dict[CurveKey, list[RunData]]:
-    """Put the runs of one curve together, in order of their seeds.
+    """Group runs by curve, sorted by seed.
 
-    Runs of one algorithm, track and named variant whose settings differ in more than `SAME_CURVE` are curves of their
-    own, and the variant of each says in what: the overrides that not all of them were given, or else the settings. What
-    one of them does not have, because it was started by an older version, is no difference.
+    Runs of one algorithm, track and named variant whose settings differ in more than `SAME_CURVE` form separate curves.
+    Their variants name the overrides that differ, or else the settings. A setting that a run lacks, because an older
+    version started it, is not a difference.
 
     Raises:
-        ValueError: two runs of one curve do not even differ in the seed.
+        ValueError: two runs of one curve have the same seed.
     """
     groups = _by_curve(runs)
     for group in groups.values():
@@ -284,15 +284,15 @@ def group_runs(runs: Sequence[RunData]) -> dict[CurveKey, list[RunData]]:
 
 
 def along(runs: Sequence[RunData], axis: str) -> tuple[list[RunData], list[str]]:
-    """Put what runs have measured on another axis than that of env_steps.
+    """Convert the metrics of runs from env_steps to another axis.
 
     Args:
-        runs: with the column of its clock.
+        runs: runs with the column of the axis's clock.
         axis: a name in `AXES`.
 
     Returns:
-        The runs, whose tables hold places on that axis where they held env_steps, and a line for each that is left out,
-        since it has not recorded the clock.
+        The runs, with env_steps in their tables replaced by positions on the axis, and a line for each run that is left
+        out because it lacks the clock.
     """
     clock = axis_of(axis).clock
     if clock is None:
@@ -309,12 +309,12 @@ def along(runs: Sequence[RunData], axis: str) -> tuple[list[RunData], list[str]]
 
 
 def _hours(steps: np.ndarray, seconds: np.ndarray) -> Callable[[np.ndarray], np.ndarray]:
-    """Return what turns env_steps into hours, between the readings of a clock."""
+    """Return a function from env_steps to hours, by linear interpolation of a clock."""
     return lambda env_steps: np.interp(env_steps, steps, seconds / 3600.0)
 
 
 def first_of_each_curve(runs: Sequence[RunData]) -> list[RunData]:
-    """Take the run of the lowest seed of each curve."""
+    """Return the run with the lowest seed of each curve."""
     return [group[0] for group in _by_curve(runs).values()]
 
 
@@ -331,7 +331,7 @@ def _by_curve(runs: Sequence[RunData]) -> dict[CurveKey, list[RunData]]:
 
 
 def _split_by_settings(runs: Sequence[RunData]) -> list[list[RunData]]:
-    """Put each run to the first others that are all set like it."""
+    """Split runs into parts with equal settings: each run joins the first part that it equals."""
     parts: list[list[RunData]] = []
     for run in runs:
         like = (part for part in parts if not any(_different(run.config, other.config) for other in part))
@@ -343,13 +343,13 @@ def _split_by_settings(runs: Sequence[RunData]) -> list[list[RunData]]:
 
 
 def _different(first: Mapping[str, Any], second: Mapping[str, Any]) -> list[str]:
-    """Name the settings that both have, with different values, and that change what is learned."""
+    """Return the names of settings that affect learning and differ between two configurations that both have them."""
     common = first.keys() & second.keys()
     return sorted(name for name in common if not name.startswith(SAME_CURVE) and first[name] != second[name])
 
 
 def _differences(parts: Sequence[Sequence[RunData]]) -> list[str]:
-    """Say of each part in what it differs from the others: nothing of a single one, and of what is as by default."""
+    """Return a label per part that names its differing settings; empty for a single part."""
     if len(parts) == 1:
         return [""]
     told = [_of_learning(part[0].overrides) for part in parts]
@@ -357,13 +357,13 @@ def _differences(parts: Sequence[Sequence[RunData]]) -> list[str]:
     labels = _name_by(told, sorted(names))
     if len(set(labels)) == len(labels):
         return labels
-    # The command lines do not tell, of two versions say; the settings do, all that runs of a part have between them.
+    # The overrides do not differ (for instance between versions): use the settings of all runs of a part.
     configs = [_of_learning({name: value for run in part for name, value in run.config.items()}) for part in parts]
     pairs = combinations(configs, 2)
     different = sorted({name for first, second in pairs for name in _different(first, second)})
     counts = range(1, len(different) + 1)
     if (enough := next((n for n in counts if _tells_apart(configs, different[:n])), None)) is None:
-        return [f"({number})" for number in range(1, len(parts) + 1)]  # what tells them apart is in every key
+        return [f"({number})" for number in range(1, len(parts) + 1)]  # they differ only in settings of every key
     more = ", …" if enough < len(different) else ""
     return [f"{label}{more}" for label in _name_by(configs, different[:enough])]
 

@@ -1,4 +1,4 @@
-"""A race in 3-D in a browser, with viser: track, flown lines, and drones with what their cameras see.
+"""3-D scene of a race in a browser, with viser: track, paths, and drones with their camera images.
 
 Shapes: K control steps of an episode; F flights shown together.
 """
@@ -25,20 +25,20 @@ if TYPE_CHECKING:
     import viser
 
 DRONE_SCALE = 3.0
-"""Times by which drones are drawn larger than they are: in a hall of 20 m one of 0.3 m could hardly be seen."""
-CAMERA_DEPTH = 0.9  # m from a drone to the image that its camera sees
+"""Scale factor of drones: at true scale, one of 0.3 m would hardly be visible in a hall of 20 m."""
+CAMERA_DEPTH = 0.9  # m from a drone to its camera image
 LINE_THICKNESS = 0.045  # m
 FLOOR_COLOR, FLOOR_LINES = "#f1f3f5", "#dee2e6"
 BOUNDS_COLOR = "#adb5bd"
-VIEW = (0.12, -0.62, 0.62)  # from the middle of a track to the eye, in units of its length [choice]
+VIEW = (0.12, -0.62, 0.62)  # viewpoint relative to the middle of a track, in units of its length [choice]
 VIEW_ANGLE = 50.0  # degrees, vertical
 
 
 def check_viser() -> None:
-    """Refuse to draw in 3-D without viser.
+    """Check that viser is installed.
 
     Raises:
-        ValueError: it is not installed; the message names the extra that brings it.
+        ValueError: it is not; the message names the extra that installs it.
     """
     if importlib.util.find_spec("viser") is None:
         raise ValueError(f"The dashboard needs the package viser: {install_extra('dashboard')}.")
@@ -46,35 +46,35 @@ def check_viser() -> None:
 
 @dataclass(frozen=True)
 class Paint:
-    """How one of the flights is told from the others."""
+    """Colours of a flight."""
 
     color: str
-    """Of the drone, and of its curves."""
+    """Colour of the drone and of its curves."""
     speeds: Colormap
-    """Of the flown line, from standing still to the highest speed of all flights shown."""
+    """Colours of the path, from zero to the highest speed of all flights shown."""
 
 
 ALONE = Paint("#1971c2", SPEED_COLORS)
-"""Of a flight that is shown alone."""
+"""Colours of a flight that is shown alone."""
 SIDE_BY_SIDE = (
     Paint("#1971c2", LinearSegmentedColormap.from_list("blue", ["#0b2f57", "#1971c2", "#99d3ff"])),
     Paint("#ae3ec9", LinearSegmentedColormap.from_list("violet", ["#4a1259", "#ae3ec9", "#f1b8ff"])),
 )
-"""Of the two flights of a comparison; bright is fast."""
+"""Colours of the two flights of a comparison; bright is fast."""
 
 
 def paints(flights: int) -> tuple[Paint, ...]:
-    """Choose the colours of one flight or of two."""
+    """Return the colours of one or two flights."""
     return (ALONE,) if flights == 1 else SIDE_BY_SIDE[:flights]
 
 
 class RaceScene:
-    """Track, lines and drones in the scene of a viser server; `place` moves the drones.
+    """Track, paths and drones in the scene of a viser server; `place` moves the drones.
 
     Args:
-        server: whose scene is filled.
-        track: that all flights are of.
-        flights: one or two.
+        server: the viser server.
+        track: the track of all flights.
+        flights: one or two flights.
     """
 
     def __init__(self, server: viser.ViserServer, track: Track, flights: Sequence[Trajectory]) -> None:
@@ -93,13 +93,13 @@ class RaceScene:
             self._drones.append(_Drone(scene, f"/drones/{index}", flight, paint))
 
     def place(self, rows: Sequence[int]) -> None:
-        """Put every drone where its flight was at a row, and show it what its camera saw there."""
+        """Move every drone to a row of its flight, and show its camera image."""
         for drone, row in zip(self._drones, rows, strict=True):
             drone.place(row)
 
 
 class _Drone:
-    """The vehicle, its axes and, of one that was flown by a camera, the camera with its image."""
+    """A drone with its axes and, if its flight has a camera, the camera with its image."""
 
     def __init__(self, scene: viser.SceneApi, name: str, flight: Trajectory, paint: Paint) -> None:
         self._flight = flight
@@ -109,19 +109,19 @@ class _Drone:
         self._camera = None if flight.camera_tilt is None else _add_camera(scene, name, flight, paint.color)
 
     def place(self, row: int) -> None:
-        """Move to a row of the flight; a drone that is there already is left alone."""
+        """Move to a row of the flight, if the drone is at another row."""
         if row == self._row:
             return
         self._row = row
         position = self._flight.position[row].numpy()
-        if np.isfinite(position).all():  # a state that was lost has no place: the drone stays at its last
+        if np.isfinite(position).all():  # a diverged state has no position: the drone stays at its last one
             self._body.position, self._body.wxyz = position, self._flight.attitude[row].numpy()
         if self._camera is not None and self._flight.pixels is not None:
             self._camera.image = self._flight.pixels[row].numpy()
 
 
 def _look_at(server: viser.ViserServer, track: Track) -> None:
-    """Let whoever opens the scene look at the whole track, obliquely from above."""
+    """Set the initial viewpoint to the whole track, obliquely from above."""
     low, high = np.array(track.bounds_low), np.array(track.bounds_high)
     middle = (low + high) / 2 * (1.0, 1.0, 0.0)
     camera = server.initial_camera
@@ -131,7 +131,7 @@ def _look_at(server: viser.ViserServer, track: Track) -> None:
 
 
 def _add_hall(scene: viser.SceneApi, track: Track) -> None:
-    """Draw the floor with a line each metre, and the edges of the bounding box."""
+    """Draw the floor with a grid of 1 m, and the edges of the bounding box."""
     low, high = np.array(track.bounds_low), np.array(track.bounds_high)
     width, depth, _ = high - low
     scene.add_grid(
@@ -157,7 +157,7 @@ def _add_hall(scene: viser.SceneApi, track: Track) -> None:
 def _add_gate(
     scene: viser.SceneApi, name: str, gate: Gate, shape: GateShape, color: str, label: str | None = None
 ) -> None:
-    """Draw a gate as four bars and, of one that has a number, an arrow in the direction of flight."""
+    """Draw a gate as four bars and, if it has a label, an arrow in the direction of flight."""
     half_yaw = math.radians(gate.yaw_degrees) / 2
     attitude = (math.cos(half_yaw), 0.0, 0.0, math.sin(half_yaw))
     scene.add_frame(name, show_axes=False, position=gate.position, wxyz=attitude)
@@ -185,16 +185,16 @@ def _add_gate(
 
 
 def _add_line(scene: viser.SceneApi, name: str, trajectory: Trajectory, colors: Colormap, speed: Normalize) -> None:
-    """Draw a flown line, coloured by speed."""
+    """Draw a path, coloured by speed."""
     points = trajectory.position.numpy()
-    points = points[np.isfinite(points).all(axis=1)]  # (K + 1, 3), or one less of a state that was lost
+    points = points[np.isfinite(points).all(axis=1)]  # (K + 1, 3), or one row less if the last state diverged
     shades = _linear(colors(speed(trajectory.speed.numpy()[: len(points)]))[:, :3])
     segments, ends = (np.stack((rows[:-1], rows[1:]), axis=1) for rows in (points, shades))  # (K, 2, 3)
     scene.add_line_segments(name, segments, ends, thickness=LINE_THICKNESS)
 
 
 def _add_airframe(scene: viser.SceneApi, name: str, color: str) -> None:
-    """Draw body, arms and rotors, as in the simulator's scene but larger, and in the flight's colour."""
+    """Draw body, arms and rotors as in the simulator's scene, but larger and in the flight's colour."""
     big, dark = DRONE_SCALE, _rgb(INK)
     scene.add_box(f"{name}/body", color=_rgb(color), dimensions=(0.12 * big, 0.06 * big, 0.04 * big))
     for index, (x, y) in enumerate(QuadrotorParameters().rotor_positions):
@@ -207,12 +207,12 @@ def _add_airframe(scene: viser.SceneApi, name: str, color: str) -> None:
             position=(place[0] / 2, place[1] / 2, 0.005 * big),
             wxyz=(math.cos(half_turn), 0.0, 0.0, math.sin(half_turn)),
         )
-        rotor = _rgb(color) if x > 0 else dark  # the front ones are bright
+        rotor = _rgb(color) if x > 0 else dark  # front rotors have the flight's colour
         scene.add_cylinder(f"{name}/rotor_{index}", 0.06 * big, 0.008 * big, rotor, position=place, opacity=0.85)
 
 
 def _add_camera(scene: viser.SceneApi, name: str, flight: Trajectory, color: str) -> viser.CameraFrustumHandle:
-    """Draw the pyramid that the camera sees, the place of its image at `CAMERA_DEPTH`."""
+    """Draw the camera's view frustum, with its image at `CAMERA_DEPTH`."""
     height, width = flight.pixels.shape[1:3] if flight.pixels is not None else (Camera.height, Camera.width)
     half = math.tan(math.radians(Camera.field_of_view) / 2)
     volume = half * (half * width / height) / 3.0  # at depth 1; its cube root is viser's measure of size
@@ -223,7 +223,7 @@ def _add_camera(scene: viser.SceneApi, name: str, flight: Trajectory, color: str
         scale=CAMERA_DEPTH * volume ** (1 / 3),
         thickness=0.025,
         color=_rgb(color),
-        format="png",  # flat colours: small, and as the agent saw them
+        format="png",  # lossless, and small for flat colours
         wxyz=_camera_attitude(float(flight.camera_tilt or 0.0)),
         position=DRONE_SCALE * np.array(Camera.position),
         cast_shadow=False,
@@ -232,7 +232,7 @@ def _add_camera(scene: viser.SceneApi, name: str, flight: Trajectory, color: str
 
 
 def _camera_attitude(tilt: float) -> tuple[float, float, float, float]:
-    """Quaternion wxyz of a camera (right x, down y, forwards z) that looks along body x, tilted up by degrees."""
+    """Return the quaternion wxyz of a camera (x right, y down, z forwards) along body x, tilted up by degrees."""
     import viser.transforms
 
     cosine, sine = math.cos(math.radians(tilt)), math.sin(math.radians(tilt))
@@ -243,12 +243,12 @@ def _camera_attitude(tilt: float) -> tuple[float, float, float, float]:
 
 
 def _linear(colors: np.ndarray) -> np.ndarray:
-    """Return sRGB colours in [0, 1] as viser takes those of single points: linear light, uint8."""
+    """Convert sRGB colours in [0, 1] to linear uint8, which viser expects for colours per point."""
     light = np.where(colors <= 0.04045, colors / 12.92, ((colors + 0.055) / 1.055) ** 2.4)
     return np.rint(255 * light).astype(np.uint8)
 
 
 def _rgb(color: str) -> tuple[int, int, int]:
-    """Return a colour as viser takes it."""
+    """Convert a colour to viser's uint8 RGB tuple."""
     red, green, blue = (round(255 * part) for part in to_rgb(color))
     return red, green, blue

@@ -1,4 +1,4 @@
-"""The picture of a sim-to-real study: success and lap time over each thing that was changed."""
+"""Figure of a sim-to-real study: success and lap time over each parameter varied."""
 
 from __future__ import annotations
 
@@ -22,23 +22,23 @@ LABELS = {
     "position_noise": ("position noise (mm)", 1e3),
     "rate": ("poses a second (Hz)", 1.0),
 }
-"""Label of each sweep's axis, and by what its values are multiplied there."""
+"""Axis label of each sweep, and the factor from its values to the label's unit."""
 
 COLORS = ("#2f5fb3", "#e8590c", "#1fa2a6", "#7950f2")
 APART = 0.16
-"""Between two studies at one value, in steps from value to value: what lies over each other cannot be told apart."""
+"""Horizontal offset between studies at one value, as a share of the step between values, against overlap."""
 NOTE = "Lines: 95 % interval over n flights (Wilson's of success, the normal one of mean laps). Values not to scale."
 
 
 def plot_study(results: Sequence[Mapping[str, Any]], path: str | Path) -> None:
-    """Draw studies beside each other: above the share of flights that finished, below the mean lap of those with one.
+    """Draw studies side by side: the share of finished flights above, the mean lap time of flights with a lap below.
 
     Args:
-        results: As recipes/sim_to_real.py writes them, one for each flyer.
+        results: Results of recipes/sim_to_real.py, one per flyer.
         path: The file to write.
 
     Raises:
-        ValueError: They hold no flight, or there are more than can be told apart.
+        ValueError: The results hold no flight, or there are more studies than colours.
     """
     sweeps = [name for name in LABELS if any(flight["sweep"] == name for r in results for flight in r["flights"])]
     if not sweeps:
@@ -58,7 +58,7 @@ def plot_study(results: Sequence[Mapping[str, Any]], path: str | Path) -> None:
 
 
 def _draw_sweep(column: np.ndarray, sweep: str, results: Sequence[Mapping[str, Any]]) -> None:
-    """Draw one sweep of all studies into its two panels, value beside value."""
+    """Draw one sweep of all studies into its two panels."""
     flown = [[flight for flight in result["flights"] if flight["sweep"] == sweep] for result in results]
     values = sorted({flight["value"] for flights in flown for flight in flights})
     for number, (result, flights, color) in enumerate(zip(results, flown, COLORS, strict=False)):
@@ -84,7 +84,7 @@ def _laps(flights: Sequence[Mapping[str, Any]]) -> Bar | None:
 
 
 def _draw_bars(axes: Axes, shift: float, bars: Sequence[Bar | None], color: str, label: str) -> None:
-    """Draw means with their intervals and n above; a value without any is a gap."""
+    """Draw means with their intervals and n above; a value without flights is a gap."""
     heights = [np.nan if bar is None else bar.height for bar in bars]
     ends = np.array([(0.0, 0.0) if bar is None else (bar.height - bar.low, bar.high - bar.height) for bar in bars]).T
     at = np.arange(len(bars)) + shift

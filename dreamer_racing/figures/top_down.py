@@ -1,4 +1,4 @@
-"""The picture of one flight: from above, along its altitude and, where gates differ in height, from the side."""
+"""Figure of one flight from above, with its altitude and, if gates differ in height, a side view."""
 
 from __future__ import annotations
 
@@ -28,21 +28,21 @@ from dreamer_racing.figures.drawing import (
 )
 from dreamer_racing.figures.profiles import altitude_legend, draw_altitude
 
-HEIGHT_SPREAD = 0.5  # m between gates, above which a side view is worth its space
-PROFILE_HEIGHT = 1.5  # inches of the altitude's panel
+HEIGHT_SPREAD = 0.5  # m between gates, above which a side view is drawn
+PROFILE_HEIGHT = 1.5  # height of the altitude panel, inches
 
 
 def plot_top_down(track: Track, trajectory: Trajectory, path: str | Path, title: str | None = None) -> None:
     """Draw a track and the path of one episode from above, its altitude, and a side view if gates differ in height.
 
-    Gates are bars with an arrow in the direction of flight and their number in the order of flight; black arrows along
+    Gates are bars with arrows in the direction of flight and their number in the order of flight; black arrows along
     the path are the camera's direction, as in the paper's figure of perception-aware flight.
 
     Args:
         track: the track.
         trajectory: the path, coloured by speed.
-        path: the file to write; missing folders are made.
-        title: above the picture; None for the track's name, and the episode's time and outcome.
+        path: the file to write; missing folders are created.
+        title: title of the figure; None for the track's name, and the episode's duration, top speed and outcome.
     """
     figure, axes, side, altitude = _layout(track)
     speed = speed_scale([trajectory])
@@ -62,7 +62,7 @@ def plot_top_down(track: Track, trajectory: Trajectory, path: str | Path, title:
 
 
 def _layout(track: Track) -> tuple[Figure, Axes, Axes | None, Axes]:
-    """Make a figure 9 inches wide whose panels have the track's proportions: map, side view if any, altitude."""
+    """Create a figure 9 inches wide with map and optional side view, both to the track's scale, and altitude."""
     width, depth, height = (high - low for low, high in zip(track.bounds_low, track.bounds_high, strict=True))
     heights = [gate.position[2] for gate in track.gates]
     metres = [depth, height] if max(heights) - min(heights) > HEIGHT_SPREAD else [depth]
@@ -73,7 +73,7 @@ def _layout(track: Track) -> tuple[Figure, Axes, Axes | None, Axes]:
 
 
 def draw_track_side(axes: Axes, track: Track) -> None:
-    """Draw a track from the side, x–z, with numbers: each gate as the outline of its frame, seen along y."""
+    """Draw a track from the side (x–z plane) with numbered gates, each as the outline of its frame."""
     (x_low, _, z_low), (x_high, _, z_high) = track.bounds_low, track.bounds_high
     axes.add_patch(Rectangle((x_low, z_low), x_high - x_low, z_high - z_low, **BOX))
     outer = track.shape.outer
@@ -84,7 +84,7 @@ def draw_track_side(axes: Axes, track: Track) -> None:
         corner = (x - width / 2, z - outer / 2)
         axes.add_patch(Rectangle(corner, width, outer, fill=False, edgecolor=GATE_COLOR, linewidth=2.0, zorder=4))
         while any(math.dist((x, z), label) < 0.6 for label in labels):
-            z += 0.3  # above the number of a gate that is hidden behind this one
+            z += 0.3  # above the number of another gate at the same place
         labels.append((x, z))
         axes.text(x, z, str(number), ha="center", va="center", fontsize=9, color=INK, bbox=BADGE, zorder=7)
     axes.set(xlabel="x (m)", ylim=(min(z_low, 0.0) - 0.2, z_high + 0.2))

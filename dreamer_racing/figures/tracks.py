@@ -1,4 +1,4 @@
-"""Tracks side by side, as maps."""
+"""Maps of several tracks in one figure."""
 
 from __future__ import annotations
 
@@ -13,15 +13,15 @@ from dreamer_racing.figures.drawing import INK, draw_track, save
 from dreamer_racing.figures.top_down import draw_track_side
 
 COLUMNS = 3
-CELL = (5.0, 5.6)  # inches of a track, width and height
+CELL = (5.0, 5.6)  # width and height per track, inches
 
 
 def plot_tracks(tracks: Sequence[Track], path: str | Path) -> None:
-    """Draw tracks from above and, below that, from the side: gates with their numbers and the direction of flight.
+    """Draw each track from above and from the side, with gate numbers and the direction of flight.
 
     Args:
-        tracks: which, at least one.
-        path: the file to write; missing folders are made.
+        tracks: at least one track.
+        path: the file to write; missing folders are created.
 
     Raises:
         ValueError: there is no track.
@@ -32,12 +32,12 @@ def plot_tracks(tracks: Sequence[Track], path: str | Path) -> None:
     rows = math.ceil(len(tracks) / columns)
     figure = Figure(figsize=(CELL[0] * columns, CELL[1] * rows), layout="constrained")
     cells = figure.subfigures(rows, columns, squeeze=False).flat
-    for cell, track in zip(cells, tracks, strict=False):  # the last row may have cells to spare
+    for cell, track in zip(cells, tracks, strict=False):  # the last row may have empty cells
         _, depth, height = (high - low for low, high in zip(track.bounds_low, track.bounds_high, strict=True))
         above, side = cell.subplots(2, 1, sharex=True, height_ratios=[depth, height])
         draw_track(above, track)
         above.set_xlabel("")
         draw_track_side(side, track)
         title = f"{track.name}: {track.num_gates} gates, {sum(track.gate_distances):.1f} m"
-        cell.suptitle(title, x=0.02, ha="left", fontsize=11, color=INK)  # of the cell: a map's own height moves it
+        cell.suptitle(title, x=0.02, ha="left", fontsize=11, color=INK)  # not a title of the map, whose height varies
     save(figure, path)

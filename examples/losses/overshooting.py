@@ -1,10 +1,10 @@
-"""Latent overshooting, a target of one's own for the world model: docs/losses.md, "A larger target".
+"""Latent overshooting, a user-defined target of the world model, see docs/losses.md, "A larger target".
 
     export PYTHONPATH=examples/losses
     ./dev python recipes/dreamer_v3.py track=circle tuned=none loss.world_model=reconstruction+overshooting:Overshooting
 
-From each record it predicts three steps without observations, by the actions that were really taken, and compares the
-prior with the posterior there. Columns: loss_overshooting, overshooting_kl.
+From each record it predicts three steps without observations, from the actions taken, and compares the prior with the
+posterior there. Columns: loss_overshooting, overshooting_kl.
 """
 
 import torch
@@ -13,9 +13,9 @@ from dreamer_racing.losses import Target, kl_losses
 
 
 class Overshooting(Target):
-    """A prior that holds after blind steps. Reference: PlaNet (Hafner et al. 2019), Eq. 7."""
+    """KL loss between prior and posterior after open-loop steps. Reference: PlaNet (Hafner et al. 2019), Eq. 7."""
 
-    steps, scale = 3, 0.3  # blind steps; weight of the loss
+    steps, scale = 3, 0.3  # open-loop steps; weight of the loss
 
     def forward(self, posterior, features, embedding, batch):
         """Return the loss and the KL, scalars; shapes as in `Target.forward`."""
@@ -28,9 +28,9 @@ class Overshooting(Target):
             belief, state = rssm.imagine_step(belief, state, action)  # one step by the prior, no image
         prior = rssm.prior_logits(belief).unflatten(0, (-1, count))
         target = posterior.posterior_logits[:, self.steps :]
-        # The first of the KL losses moves the prior only, here with the dynamics that led to it
+        # The first KL loss trains only the prior, here through the dynamics that led to it
         loss, _, kl = kl_losses(target, prior, self.config.free_nats, rssm.unimix)
-        # Across the first record of an episode nothing is compared: it belongs to another flight
+        # Predictions across the start of an episode are masked
         crossed = torch.stack([batch["is_init"][:, records, 0] for records in ahead]).any(0)
         same_episode = (~crossed).float()
         return {
