@@ -69,7 +69,7 @@ lap time           best 3.96 s, mean 4.06 s (297 laps)
 | minutes | of one core, for the whole training. Rows are of different CPUs (factor two): compare env_steps |
 | state decoded; images alone | in training the world model learns the true state; it does not. In flight agents see only images |
 | stopped | ended by hand, before the planned number of env_steps |
-| `schedule.NAME` | moves setting NAME during training as more gates are passed ([clock `known`](recipes.md#options)) |
+| `schedule.NAME` | moves setting NAME as more gates are passed ([clock `known`](recipes.md#options)) |
 """
 FOOT = """## Where the numbers come from
 
