@@ -68,7 +68,6 @@ lap time           best 3.96 s, mean 4.06 s (297 laps)
 | sampled | success of the stochastic policy, whose actions are samples from its distribution |
 | minutes | of one core, for the whole training. Rows are of different CPUs (factor two): compare env_steps |
 | state decoded | in training the world model learns the true state; in flight the agent sees only images |
-| stopped | ended by hand, before the planned number of env_steps |
 | `schedule.NAME` | moves setting NAME as more gates are passed ([clock `known`](recipes.md#options)) |
 """
 FOOT = """## Where the numbers come from
