@@ -110,7 +110,7 @@ def through(firmware: SteppedFirmware, vehicle: PlantVehicle, delivery: Delivery
     firmware.start()
     rates = rate_map(read_contract(AGENTS / "circle" / "contract.json"))
     step = FirmwareStep(vehicle, firmware, ChannelLink(Radio(firmware), encode_sitl, rates, THRUST), delivery)
-    step.get_ready()
+    step.wait_until_ready()
     return step
 
 

@@ -209,7 +209,7 @@ def drift(learner: WorldModelLearner, replay: StreamReplay) -> Iterator[dict[str
     for _ in range(BATCHES):
         batch = replay.sample()
         _, seen = learner.world_model_loss(batch)
-        before, after, same = learner.then_and_now(seen, batch)
+        before, after, same = learner.stored_and_current_features(seen, batch)
         divergence, same = learner.agent.actor(before).divergence(learner.agent.actor(after)), same.squeeze(-1)
         moved.append(divergence.squeeze(-1)[same])
         recent.append(batch["recent"].reshape(len(same), -1)[:, :1].expand_as(same)[same])

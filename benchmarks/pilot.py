@@ -16,7 +16,7 @@ from typing import Any
 import torch
 from measuring import make_parser, report
 
-from dreamer_racing.envs.race.flown_laps import FlownLaps, fly_laps
+from dreamer_racing.envs.race.flown_laps import PilotStatistics, evaluate_pilot
 from dreamer_racing.envs.race.gates import CrashCause
 from dreamer_racing.envs.race.pilot import ScriptedPilot
 from dreamer_racing.envs.race.racing_line import LineLimits
@@ -39,7 +39,7 @@ def main() -> None:
         for preset in arguments.presets:
             pilot = ScriptedPilot(track, preset, LineLimits(speed=arguments.speed), dtype=torch.float64)
             randomised = arguments.random_starts or pilot.parameters.randomisation is not None
-            flight = fly_laps(
+            flight = evaluate_pilot(
                 track,
                 preset,
                 arguments.num_envs if randomised else 1,
@@ -51,7 +51,7 @@ def main() -> None:
     report(records, ("track", "preset", "speed", *COLUMNS), arguments.json)
 
 
-def summary(flight: FlownLaps) -> dict[str, Any]:
+def summary(flight: PilotStatistics) -> dict[str, Any]:
     """Return the statistics of some runs."""
     flying_laps = flight.lap_times[:, 1:]
     flying_laps = flying_laps[flying_laps.isfinite()]

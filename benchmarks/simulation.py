@@ -40,7 +40,7 @@ from torchrl.envs.utils import RandomPolicy
 
 from dreamer_racing.envs.policy_memory import with_memory
 from dreamer_racing.envs.simulator.opengl import RendererUnavailableError
-from dreamer_racing.envs.simulator.rendering import HYBRID, RENDERERS
+from dreamer_racing.envs.simulator.rendering import RENDERERS, WARP_CUDA
 from dreamer_racing.envs.simulator.scene import Camera
 from dreamer_racing.envs.torchrl_env import DroneRacingEnv
 from dreamer_racing.learners.dreamer_v3 import DreamerV3
@@ -57,7 +57,7 @@ PAGE = Path(__file__).parents[1] / "docs" / "benchmarks.md"
 BEGIN, END = "<!-- benchmarks/simulation.py writes this -->", "<!-- end -->"
 NAMES = {
     "none": "none", "egl": "EGL (Mesa, in software)", "osmesa": "OSMesa", "warp": "ray caster, no OpenGL library",
-    HYBRID: "physics on CPU, ray caster on CUDA", "cuda": "all on CUDA",
+    WARP_CUDA: "physics on CPU, ray caster on CUDA", "cuda": "all on CUDA",
 }  # fmt: skip
 
 
@@ -68,7 +68,7 @@ def main() -> None:
     parser.add_argument("--track", default="kidney")
     parser.add_argument("--preset", default="easy")
     parser.add_argument(
-        "--images", nargs="*", help=f"of {' '.join(('none', *RENDERERS, HYBRID, 'cuda'))}; default: the device's"
+        "--images", nargs="*", help=f"of {' '.join(('none', *RENDERERS, WARP_CUDA, 'cuda'))}; default: the device's"
     )
     parser.add_argument("--looks", default="nominal", help="nominal | randomised")
     parser.add_argument("--image-size", type=int, default=64, help="pixels")
@@ -98,11 +98,11 @@ def jobs(arguments: argparse.Namespace) -> Iterator[tuple[Any, ...]]:
     """Yield the function and the arguments of every requested measurement."""
     on_cuda = arguments.device == "cuda"
     actor = arguments.actor or ("size12m" if on_cuda else "cpu_small")
-    # On CUDA the defaults take a minute or two of GPU time; HYBRID and others only on request.
+    # On CUDA the defaults take a minute or two of GPU time; WARP_CUDA and others only on request.
     for images in arguments.images or (("none", "cuda") if on_cuda else ("none", *RENDERERS)):
         state, pixels = ((4096,), (256, 1024, 4096)) if on_cuda else ((32, 512, 2048), (32, 64, 256))
         for num_envs in arguments.num_envs or (state if images == "none" else pixels):
-            device = "cpu" if images == HYBRID else arguments.device
+            device = "cpu" if images == WARP_CUDA else arguments.device
             settings = {"preset": arguments.preset, "device": device, "looks": arguments.looks}
             yield measure, images, num_envs, arguments.track, settings, actor, arguments.seconds, arguments.image_size
 

@@ -31,7 +31,7 @@ from measuring import make_parser, print_table, write_json
 from omegaconf import OmegaConf
 from tensordict import TensorDictBase
 from torch import Tensor
-from trained import Trained, WorldModelRunConfig, fly, restore, restore_replay, size_of, worlds_of
+from trained import Trained, WorldModelRunConfig, fly, restore, restore_replay, shared_env_arguments, size_of
 
 from dreamer_racing.envs import DroneRacingEnv
 from dreamer_racing.learners.dreamer_v3 import DreamerV3
@@ -87,7 +87,7 @@ def as_flown(trained: Trained) -> dict[str, Any]:
         miss_radius=env.miss_radius,
         looks=env.looks,
         seed=trained.config.seed,
-        **worlds_of(trained.config),
+        **shared_env_arguments(trained.config),
     )
     flight = fly(trained.learner, worlds, STEPS)
     shown = join_features(flight["belief"], flight["state"]).float(), flight["vector"]

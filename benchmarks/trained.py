@@ -10,7 +10,7 @@ from tensordict import TensorDict
 
 sys.path.append(str(Path(__file__).parents[1] / "recipes"))
 
-from composing.building import Environment, make_curriculum, make_env, make_run_replay, size_of, worlds_of
+from composing.building import Environment, make_curriculum, make_env, make_run_replay, shared_env_arguments, size_of
 from composing.restoring import restore_learner
 from composing.saved import trained_config
 from composing.schema import WorldModelRunConfig
@@ -22,7 +22,16 @@ from dreamer_racing.modules.interface import PRIVILEGED
 from dreamer_racing.training.checkpoint import load_components
 from dreamer_racing.training.directory import RunDirectory, latest_checkpoint
 
-__all__ = ["Trained", "WorldModelRunConfig", "fly", "make_env", "restore", "restore_replay", "size_of", "worlds_of"]
+__all__ = [
+    "Trained",
+    "WorldModelRunConfig",
+    "fly",
+    "make_env",
+    "restore",
+    "restore_replay",
+    "shared_env_arguments",
+    "size_of",
+]
 
 
 class Trained(NamedTuple):

@@ -21,7 +21,7 @@ from packaging.specifiers import SpecifierSet
 
 from dreamer_racing.caches import ensure_caches, warp_cache, why_not_writable
 from dreamer_racing.commands import install_extra
-from dreamer_racing.envs.gl_variables import VARIABLES, refused
+from dreamer_racing.envs.gl_variables import VARIABLES, unset_variables
 from dreamer_racing.envs.simulator.opengl import GL_LIBRARIES, loads
 
 DISTRIBUTION = "dreamer_racing"
@@ -245,7 +245,7 @@ def renderers(probes: dict[str, subprocess.Popen[str]]) -> Iterator[Diagnosis]:
 
 def variables() -> Iterator[Diagnosis]:
     """Report environment variables that would break OpenGL and were therefore ignored."""
-    for setting, reason in refused.items():
+    for setting, reason in unset_variables.items():
         name = setting.partition("=")[0]
         yield Diagnosis(name, Verdict.note, f"{setting} is left out of account: {reason}", f"unset {name}")
 

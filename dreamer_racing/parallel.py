@@ -1,11 +1,11 @@
 """Data-parallel training: each process has a share of the environments, the replay and the batch, and equal networks.
 
-``torchrun`` starts the processes, and ``join`` connects them; no other module uses ``torch.distributed``. Before
-``join``, and with a single process, every function returns its argument. docs/scaling.md lists what is reduced over
+``torchrun`` starts the processes, and ``init`` connects them; no other module uses ``torch.distributed``. Before
+``init``, and with a single process, every function returns its argument. docs/scaling.md lists what is reduced over
 the processes and what is not.
 
 All processes must make the same calls in the same order. So every decision about how a run continues (a KL divergence
-that ends the epochs, a signal, a timer) must first be made equal in all processes, by ``agreed`` or a reduction.
+that ends the epochs, a signal, a timer) must first be made equal in all processes, by ``broadcast`` or a reduction.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ def asked_for() -> int:
     return int(os.environ.get("WORLD_SIZE") or 1)
 
 
-def join() -> None:
+def init() -> None:
     """Initialise the process group, if there are several processes: NCCL for CUDA devices, Gloo for the CPU.
 
     Raises:
@@ -61,21 +61,21 @@ def join() -> None:
         torch.cuda.set_device(device)
 
 
-def leave() -> None:
+def destroy() -> None:
     """Destroy the process group."""
     if _here.processes > 1:
         _here.rank, _here.processes = 0, 1
         dist.destroy_process_group()
 
 
-def count() -> int:
+def num_processes() -> int:
     """Return the number of processes that train together; 1 for this one alone."""
     return _here.processes
 
 
-def count_here() -> int:
+def num_local_processes() -> int:
     """Return the number of processes on this machine."""
-    return min(count(), int(os.environ.get("LOCAL_WORLD_SIZE", count())))
+    return min(num_processes(), int(os.environ.get("LOCAL_WORLD_SIZE", num_processes())))
 
 
 def rank() -> int:
@@ -133,7 +133,7 @@ def total(values: Tensor) -> Tensor:
 
 
 @torch.no_grad()
-def gathered(values: Tensor, dim: int) -> Tensor:
+def all_gather(values: Tensor, dim: int) -> Tensor:
     """All-gather tensors of equal shape and concatenate them along ``dim`` in the order of ranks, without gradient."""
     if _here.processes == 1:
         return values
@@ -142,15 +142,15 @@ def gathered(values: Tensor, dim: int) -> Tensor:
     return torch.cat(parts, dim)
 
 
-def gathered_rows(rows: TensorDictBase) -> TensorDictBase:
+def all_gather_rows(rows: TensorDictBase) -> TensorDictBase:
     """Concatenate the rows ``[E]`` of all processes in the order of ranks, on the CPU; E may differ among them."""
     if _here.processes == 1:
         return rows
-    parts = [TensorDict(part, [length]) for length, part in _gathered_objects((len(rows), rows.to_dict()))]
+    parts = [TensorDict(part, [length]) for length, part in _all_gather_objects((len(rows), rows.to_dict()))]
     return torch.cat(parts)
 
 
-def agreed(value: T) -> T:
+def broadcast(value: T) -> T:
     """Broadcast a picklable value of rank 0 to all processes."""
     if _here.processes == 1:
         return value
@@ -159,7 +159,7 @@ def agreed(value: T) -> T:
     return box[0]
 
 
-def largest(value: int) -> int:
+def all_reduce_max(value: int) -> int:
     """Return the maximum of a number over the processes."""
     if _here.processes == 1:
         return value
@@ -168,7 +168,7 @@ def largest(value: int) -> int:
     return int(box)
 
 
-def together(action: Callable[[], object]) -> None:
+def run_in_all(action: Callable[[], object]) -> None:
     """Run an action in every process, and wait until all have finished it.
 
     Raises:
@@ -182,7 +182,7 @@ def together(action: Callable[[], object]) -> None:
         action()
     except Exception as error:
         failure = error
-    words = _gathered_objects("" if failure is None else f"process {_here.rank}: {failure}")
+    words = _all_gather_objects("" if failure is None else f"process {_here.rank}: {failure}")
     if failure is not None:
         raise failure
     if any(words):
@@ -199,14 +199,14 @@ def check_same(values: Sequence[Tensor]) -> None:
         return
     with torch.no_grad():
         sums = torch.stack([value.double().sum() for value in values]).tolist()
-    if any(other != sums for other in _gathered_objects(sums)):
+    if any(other != sums for other in _all_gather_objects(sums)):
         raise RuntimeError(
             "The networks of the processes are no longer the same, so their averaged gradients mean nothing: they must "
             "run on devices of one kind with the same versions. This should be reported as a defect if they do."
         )
 
 
-def _gathered_objects(value: T) -> list[T]:
+def _all_gather_objects(value: T) -> list[T]:
     """Return the values of all processes, in the order of ranks."""
     box: list[Any] = [None] * _here.processes
     dist.all_gather_object(box, value)

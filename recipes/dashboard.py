@@ -17,7 +17,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple
 
-from composing.building import worlds_of
+from composing.building import shared_env_arguments
 from composing.entry import plain_errors, recipe
 from composing.restoring import FlightConfig, restore
 
@@ -148,7 +148,7 @@ def read(file: Path) -> Source:
 def fly(place: str, config: DashboardConfig) -> Source:
     """Fly the deterministic policy of an agent once, as recipes/fly.py does."""
     restored = restore(FlightConfig(checkpoint=place, renderer=config.renderer, seed=config.seed))
-    worlds = worlds_of(restored.trained) | {"seed": config.seed}
+    worlds = shared_env_arguments(restored.trained) | {"seed": config.seed}
     policy, value_function = restored.flyer.evaluation_policy(), restored.flyer.value_function()
     flown = fly_races(policy, worlds, episodes=1, value_function=value_function)
     print(flown.summary())

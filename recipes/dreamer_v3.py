@@ -38,7 +38,7 @@ def train(config: DreamerV3RunConfig, session: Session) -> None:
     env = make_own_env(own)
     learner = cast(DreamerV3, building.make_learner(own, Interface.of(env), own.device, config.seed))
     if config.init_from and not config.resume:
-        print(building.begin_with(learner, config, env))
+        print(building.load_initial_weights(learner, config, env))
     building.seed_generators(own.seed)
     curriculum = building.make_curriculum(config, env)
     rollouts = make_rollouts(own, env, learner)

@@ -14,9 +14,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, cast
 
-from composing.building import make_evaluator, worlds_of
+from composing.building import make_evaluator, shared_env_arguments
 from composing.entry import plain_disk_errors, plain_errors, recipe
-from composing.restoring import FlightConfig, Restored, heading, restore
+from composing.restoring import FlightConfig, Restored, report_heading, restore
 
 from dreamer_racing.envs.race.starts import StartSampler
 from dreamer_racing.envs.tracks import Track
@@ -68,7 +68,7 @@ def main(config: EvaluateConfig) -> None:
     """Restore the policy, fly it, report."""
     with plain_errors():
         restored = restore(config)
-        refuse_races(config, restored.trained.track_as_begun())
+        refuse_races(config, restored.trained.saved_track())
         directory = fresh_directory(config.run_dir or RunDirectory(restored.run_dir).evaluation, EVALUATION)
         print(f"race: {restored.trained.track}, {restored.trained.env.preset}, {config.episodes} episodes")
         report = make_nominal_report(config, restored, directory) if config.protocol == "nominal" else None
@@ -126,7 +126,7 @@ def evaluate_fully(config: EvaluateConfig, restored: Restored, directory: Path) 
     if config.episodes < EPISODES:
         print(f"note: the protocol asks for {EPISODES} episodes of each condition; episodes={config.episodes}")
     trained = restored.trained
-    policy, worlds = restored.flyer.evaluation_policy(), worlds_of(trained)
+    policy, worlds = restored.flyer.evaluation_policy(), shared_env_arguments(trained)
     results = []
     for result in run_protocol(policy, worlds, config.episodes, num_envs=config.num_envs, seed=config.seed):
         results.append(result)
@@ -164,7 +164,7 @@ def write_markdown(directory: Path, results: list[Result], provenance: dict[str,
         plot_crashes(flown, RunDirectory(directory).plots / f"crashes_{preset}.png", f"{title}, nominal, {preset}")
     meanings = "\n".join(f"- `{condition.name}`: {condition.meaning}" for condition in CONDITIONS)
     plots = "\n\n".join(f"![{name}](plots/{name}.png)" for name in ("conditions", *(f"crashes_{p}" for p in PRESETS)))
-    text = f"{heading(title, provenance)}\n{results_table(results)}\n{meanings}\n\n{plots}\n"
+    text = f"{report_heading(title, provenance)}\n{results_table(results)}\n{meanings}\n\n{plots}\n"
     (directory / "evaluation.md").write_text(text, encoding="utf-8")
 
 

@@ -36,7 +36,7 @@ from dreamer_racing.training.directory import RunDirectory, latest_checkpoint
 FOLDER = Path(__file__).resolve().parent
 LOG = "log.txt"
 SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGUSR1, signal.SIGUSR2)
-OWN = ("name", "algorithm", "variant", "variants", "overrides", "directory")  # not for recipes
+EXPERIMENT_SETTINGS = ("name", "algorithm", "variant", "variants", "overrides", "directory")  # not for recipes
 
 # Launchers start processes that must find the modules of this folder.
 os.environ["PYTHONPATH"] = os.pathsep.join(filter(None, [str(FOLDER), os.environ.get("PYTHONPATH")]))
@@ -64,7 +64,7 @@ def main(settings: ExperimentConfig) -> None:
     note = run_dir.parent / FAILURES / f"{run_dir.name}.txt"
     note.unlink(missing_ok=True)
     try:
-        bring_to_its_end(settings, run_dir, list(HydraConfig.get().overrides.task))
+        complete_run(settings, run_dir, list(HydraConfig.get().overrides.task))
     except (ValueError, OSError, RuntimeError, HydraException) as error:
         if isinstance(error, HydraException):
             error = ValueError(in_plain_words(error, settings.algorithm, settings.overrides))
@@ -88,7 +88,7 @@ def directory_of(config: ExperimentConfig) -> Path:
     return Path(config.directory).absolute() / config.name / name
 
 
-def bring_to_its_end(config: ExperimentConfig, run_dir: Path, given: list[str]) -> None:
+def complete_run(config: ExperimentConfig, run_dir: Path, given: list[str]) -> None:
     """Start, resume or skip a run, and print which.
 
     Raises:
@@ -122,7 +122,7 @@ def next_command(config: ExperimentConfig, given: list[str]) -> list[str] | None
     check(config)
     run_dir = directory_of(config)
     chosen = [f"track={config.track}", f"seed={config.seed}", f"budget={config.budget}", *config.overrides]
-    of_recipe = [override for override in given if override_key(override).partition(".")[0] not in OWN]
+    of_recipe = [override for override in given if override_key(override).partition(".")[0] not in EXPERIMENT_SETTINGS]
     overrides = merge_overrides(chosen, of_recipe)
     overrides += config.variants[config.variant]
     wanted = cast(RunConfig, compose(config.algorithm, overrides))

@@ -21,7 +21,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from composing.building import describe_file, worlds_of
+from composing.building import serialize_track_file, shared_env_arguments
 from composing.entry import as_override, override_key, override_value, plain_errors, recipe
 from composing.options import command
 from composing.restoring import config_folder, find_trained, results_of
@@ -59,7 +59,7 @@ from dreamer_racing.settings import COUNT, SEED, setting
 from dreamer_racing.training.directory import RunDirectory
 
 BY_ITEM = ("episodes", "crashes_by_gate")  # entries of an evaluation that agent.json leaves out
-OF_A_MACHINE = ("run_dir", "resume", "device", "env.device")  # settings that do not affect what is learned
+MACHINE_SETTINGS = ("run_dir", "resume", "device", "env.device")  # settings that do not affect what is learned
 
 
 @dataclass
@@ -107,7 +107,7 @@ def export(config: ExportConfig) -> None:
     if not is_race(trained):
         raise ValueError(f"{checkpoint} was trained on {trained.task}; this recipe exports actors that race.")
     if trained.track_description is None:  # also for runs from before it was noted
-        trained.track_description = describe_file(trained.track)
+        trained.track_description = serialize_track_file(trained.track)
     if trained.env.vector is not None:
         raise ValueError(
             f"{checkpoint} was trained with env.vector={trained.env.vector}, which computes from the simulator's state "
@@ -142,7 +142,7 @@ def prepare(
         seed=config.seed,
         episode_steps=episode_steps(config.steps),
         num_threads=1,
-        **worlds_of(trained) | {"renderer": config.renderer, "device": "cpu", "reward": None},
+        **shared_env_arguments(trained) | {"renderer": config.renderer, "device": "cpu", "reward": None},
     )
     try:
         if is_agent(checkpoint):
@@ -156,12 +156,12 @@ def prepare(
         flight = record_flight(env, agent, config.steps)
     finally:
         env.close()
-    track = trained.track_as_begun()
+    track = trained.saved_track()
     contract = make_contract(
         step,
         env.worlds.parameters,
         env.worlds.camera,
-        load_imu(worlds_of(trained)["imu"]),
+        load_imu(shared_env_arguments(trained)["imu"]),
         checkpoint=checkpoint.name,
         env_steps=metadata["env_steps"],
         weights=metadata["weights"],
@@ -230,7 +230,7 @@ def history_of(checkpoint: Path, env_steps: int) -> list[dict[str, Any]]:
 
 def without_machine(overrides: Iterable[str]) -> list[str]:
     """Return overrides without those that are specific to a machine, and of a track's file only the name."""
-    kept = [text for text in overrides if override_key(text) not in OF_A_MACHINE]
+    kept = [text for text in overrides if override_key(text) not in MACHINE_SETTINGS]
     files = {text: Path(str(override_value(text))).name for text in kept if override_key(text) == "track"}
     return [as_override("track", files[text]) if text in files else text for text in kept]
 
@@ -244,7 +244,7 @@ def read_evaluation(
         FileNotFoundError: there is none.
         ValueError: it is of other weights or another track, or no evaluation; the message says how to make one.
     """
-    track_sha256 = hash_track(trained.track_as_begun())
+    track_sha256 = hash_track(trained.saved_track())
     path = Path(config.evaluation or newest_evaluation(results_of(checkpoint), weights_sha256, track_sha256))
     how = f"Make it with: {command('evaluate')} checkpoint={shlex.quote(config.checkpoint)} episodes=100"
     if not path.is_file():
@@ -297,12 +297,12 @@ def measure(step: ActorStep, flight: RecordedFlight, output: Path, parts: bool) 
     """Print how long one step takes with one thread."""
     contract = read_contract(output.parent / CONTRACT)
     actors = {"onnxruntime": OnnxActor(output, whole=True), "torch": TorchActor(contract, step)}
-    felt = {} if flight.imu is None else {"imu": flight.imu[0]}
+    imu = {} if flight.imu is None else {"imu": flight.imu[0]}
     for name, actor in actors.items():
-        print(f"one step, 1 thread, {name}: {measure_latency(partial(actor.step, **felt), flight.observations)}")
+        print(f"one step, 1 thread, {name}: {measure_latency(partial(actor.step, **imu), flight.observations)}")
     if parts:
         actor = OnnxActor(output)
-        latency = measure_latency(partial(actor.step, **felt), flight.observations, actor.prepare)
+        latency = measure_latency(partial(actor.step, **imu), flight.observations, actor.prepare)
         print(f"of it from image to action: {latency}")
 
 

@@ -24,7 +24,7 @@ from typing import Any
 
 import composing  # noqa: F401 - first: explains how to run this if packages are missing
 import numpy as np
-from composing.building import worlds_of
+from composing.building import shared_env_arguments
 from composing.entry import plain_errors, recipe
 from composing.restoring import FlightConfig, restore
 from tensordict import TensorDictBase
@@ -248,7 +248,7 @@ def agents_flight(config: FlyConfig) -> PlannedFlight:
                 raise ValueError(
                     f"{name}={given}: {config.agent} was trained with {name}={trained}, and flies with nothing else."
                 )
-        worlds = worlds_of(restored.trained) | {"seed": config.seed}
+        worlds = shared_env_arguments(restored.trained) | {"seed": config.seed}
         track = load_track(worlds["track"])
     print(f"{config.agent} on {track.name}, {track.laps} laps, physics: {restored.trained.env.preset}")
     course = Course(restored.flyer.evaluation_policy(), worlds, episodes=1)

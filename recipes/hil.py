@@ -57,14 +57,14 @@ from dreamer_racing.hil.recording import FILE, TRACK, Flight, FlightRecorder
 from dreamer_racing.hil.view import LiveView
 
 STATISTICS = "statistics.json"
-plainly = partial(plain_errors, also=(ImportError,))
+plain_hil_errors = partial(plain_errors, also=(ImportError,))
 """As `plain_errors`, also for links and pose sources whose optional packages are missing."""
 
 
 @recipe("hil", HilConfig)
 def main(config: HilConfig) -> None:
     """Fly, or replay or report a recorded flight."""
-    with plainly():
+    with plain_hil_errors():
         check(config)
         if config.actor is None:
             raise SystemExit(replay(config) if config.replay else report(config))
@@ -99,10 +99,10 @@ def make_flyer(config: HilConfig, track: Track | None = None) -> tuple[Flyer, di
 def fly(config: HilConfig) -> int:
     """Fly one flight; return the exit status: 0 if it flew, passed the gates of all laps=, and was not cut off."""
     with ExitStack() as opened:
-        with plainly():
+        with plain_hil_errors():
             flight = prepare(config, opened)
         ended = flight.loop.run(config.duration, config.patience)  # errors in flight are defects: with traceback
-        with plainly():
+        with plain_hil_errors():
             opened.close()
             summary = conclude(config, flight, ended)
     say(summary)

@@ -41,7 +41,7 @@ def train(config: LatentPPORunConfig, session: Session) -> None:
     env = make_own_env(own)
     learner = cast(LatentPPO, building.make_learner(own, Interface.of(env), own.device, config.seed))
     if config.init_from and not config.resume:
-        print(building.begin_with(learner, config, env))
+        print(building.load_initial_weights(learner, config, env))
     building.seed_generators(own.seed)
     curriculum = building.make_curriculum(config, env)
     rollouts = make_rollouts(own, env, learner)
@@ -90,7 +90,7 @@ def train(config: LatentPPORunConfig, session: Session) -> None:
                 batch = replay.sample()
             metrics = learner.update(batch, session.timed)
             session.log(metrics)
-            lag.trained(metrics)
+            lag.add_training_error(metrics)
             if config.replay.context and learner.latents is not None:  # later windows begin with these latents
                 replay.refresh(batch["index"], learner.latents["belief"], learner.latents["state"])
 

@@ -13,9 +13,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from composing.building import worlds_of
+from composing.building import shared_env_arguments
 from composing.entry import plain_disk_errors, plain_errors, recipe
-from composing.restoring import FlightConfig, Restored, heading, restore
+from composing.restoring import FlightConfig, Restored, report_heading, restore
 from composing.schema import RunConfig
 
 from dreamer_racing.envs.simulator.scene import Camera
@@ -57,12 +57,12 @@ def main(config: PerceptionConfig) -> None:
     corrupted = {noise: fly_corrupted(config, restored, noise) for noise in (NO_NOISE, START_NOISE)}
     provenance = restored.provenance(config)
     with plain_disk_errors():
-        write(directory, looked, corrupted, provenance, worlds_of(restored.trained)["camera"])
+        write(directory, looked, corrupted, provenance, shared_env_arguments(restored.trained)["camera"])
     say(f"\nwritten to {directory}")
 
 
 @dataclass
-class Looked:
+class SightResults:
     """Results of the flights without or with decoys, and what the camera was pointed at."""
 
     track: Track
@@ -82,7 +82,7 @@ class Looked:
 
 def tracks_to_fly(trained: RunConfig) -> dict[str, Track]:
     """Return the track without decoys and, if it defines places for them, with them."""
-    track = trained.track_as_begun()
+    track = trained.saved_track()
     if trained.decoys is None and not track.decoys:
         track = with_decoys(track, decoys_for(track))
     plain = {WITHOUT: with_decoys(track, "none")}
@@ -92,9 +92,9 @@ def tracks_to_fly(trained: RunConfig) -> dict[str, Track]:
     return plain | {WITH: track}
 
 
-def fly_and_look(config: PerceptionConfig, restored: Restored, tracks: dict[str, Track]) -> dict[str, Looked]:
+def fly_and_look(config: PerceptionConfig, restored: Restored, tracks: dict[str, Track]) -> dict[str, SightResults]:
     """Fly the deterministic policy without and with decoys from the same noisy starts; measure what it looked at."""
-    worlds = worlds_of(restored.trained) | {"start_noise": START_NOISE, "seed": config.seed}
+    worlds = shared_env_arguments(restored.trained) | {"start_noise": START_NOISE, "seed": config.seed}
     decoys = next(reversed(tracks.values())).decoys  # also for flights without: where they would stand
     looked = {}
     for name, track in tracks.items():
@@ -108,14 +108,14 @@ def fly_and_look(config: PerceptionConfig, restored: Restored, tracks: dict[str,
         )
         say(f"\n{name}, {len(flown.trajectories)} flights recorded\n{flown.summary()}")
         sights = measure_sight(flown.trajectories, track, worlds["camera"], decoys)
-        looked[name] = Looked(track, flown.gates_per_episode, flown.success_rate, flown.trajectories[0], sights)
+        looked[name] = SightResults(track, flown.gates_per_episode, flown.success_rate, flown.trajectories[0], sights)
     return looked
 
 
 def fly_corrupted(config: PerceptionConfig, restored: Restored, start_noise: float) -> list[Result]:
     """Fly the policy in both modes on the requested track, with every corruption of its images."""
     trained = restored.trained
-    worlds = worlds_of(trained) | {"start_noise": start_noise, "seed": config.seed}
+    worlds = shared_env_arguments(trained) | {"start_noise": start_noise, "seed": config.seed}
     results = []
     for name, make in CORRUPTIONS.items():
         for mode in MODES:
@@ -128,7 +128,7 @@ def fly_corrupted(config: PerceptionConfig, restored: Restored, start_noise: flo
 
 def write(
     directory: Path,
-    looked: dict[str, Looked],
+    looked: dict[str, SightResults],
     corrupted: dict[float, list[Result]],
     provenance: dict[str, Any],
     camera: Camera,
@@ -151,10 +151,10 @@ def write(
 
 
 def to_markdown(
-    title: str, looked: dict[str, Looked], corrupted: dict[float, list[Result]], provenance: dict[str, Any]
+    title: str, looked: dict[str, SightResults], corrupted: dict[float, list[Result]], provenance: dict[str, Any]
 ) -> str:
     """Return the tables as a Markdown page."""
-    parts = [heading(title, provenance), "## What the camera is turned to\n", START_TEXT[START_NOISE]]
+    parts = [report_heading(title, provenance), "## What the camera is turned to\n", START_TEXT[START_NOISE]]
     sights = {name: kind.sights for name, kind in looked.items()}
     parts += [sight_table(sights), "Share of time in view, gate by gate:\n", gate_table(sights)]
     parts.append("![perception](perception.png)\n")

@@ -22,7 +22,7 @@ from dreamer_racing.export.onnx_actor import read_contract
 from dreamer_racing.hil.betaflight import print_settings
 from dreamer_racing.hil.configuration import PILOT, HilConfig, pilot_contract
 from dreamer_racing.plant.delivery import Delivery
-from dreamer_racing.plant.process import ProcessOptions, by_firmware, open_sockets, run, start_firmware
+from dreamer_racing.plant.process import ProcessOptions, firmware_option, open_sockets, run, start_firmware
 from dreamer_racing.plant.vehicle import Mismatch, PlantVehicle
 
 
@@ -37,7 +37,7 @@ class PlantConfig(ProcessOptions, Delivery, Mismatch):
 
     def check(self) -> None:
         """Refuse a command delay if a firmware flies, and an actor without a firmware to set up for it."""
-        if self.delay is not None and (name := by_firmware(self)):
+        if self.delay is not None and (name := firmware_option(self)):
             raise ValueError(f"delay={self.delay} is of commands, and {name}={getattr(self, name)}: leave one out.")
         if self.actor != PILOT and self.firmware is None:
             raise ValueError(f"actor={self.actor} is for firmware=, which is set up for it: add that, or leave it out.")

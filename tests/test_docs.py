@@ -19,7 +19,7 @@ import dreamer_racing
 from dreamer_racing import GYM_ENVIRONMENTS
 from dreamer_racing.envs import DroneRacingEnv
 from dreamer_racing.envs.race.gates import CrashCause
-from dreamer_racing.envs.simulator.rendering import HYBRID, RENDERERS
+from dreamer_racing.envs.simulator.rendering import RENDERERS, WARP_CUDA
 from dreamer_racing.envs.worlds import RaceOptions
 from dreamer_racing.learners.latent_ppo import CRITICS
 from dreamer_racing.losses import TARGETS
@@ -121,7 +121,7 @@ def test_commands_name_settings_that_there_are(page: Path) -> None:
     known = module_of("recipes", "composing.options")
     for name, given in commands(page.read_text(encoding="utf-8")):
         assert (ROOT / "recipes" / f"{name}.py").is_file(), name
-        known.refuse_slips(name, given)
+        known.check_arguments(name, given)
 
 
 def test_commands_are_found_with_their_settings() -> None:
@@ -177,7 +177,7 @@ class Config:
 
 def test_names_that_are_chosen_from_are_all_on_their_pages(options):
     rows = dict(re.findall(r"^\| `([\w.]+)=` (.*)$", options.PAGE.read_text(encoding="utf-8"), re.M))
-    for name in ("auto", *RENDERERS, HYBRID):
+    for name in ("auto", *RENDERERS, WARP_CUDA):
         assert re.search(rf"\b{name}\b", rows["env.renderer"]), name
     for name in (*TARGETS, *CRITICS):
         assert any(f"`{name}`" in rows[f"loss.{setting}"] for setting in ("world_model", "critic")), name

@@ -40,12 +40,14 @@ Losses = DreamerV3Losses | LatentPPOLosses
 
 def share_of_ppo(ppo: PPOUpdateConfig) -> PPOUpdateConfig:
     """The numbers of each process."""
-    return replace(ppo, steps=ppo.steps // parallel.count(), minibatch=ppo.minibatch // parallel.count())
+    return replace(
+        ppo, steps=ppo.steps // parallel.num_processes(), minibatch=ppo.minibatch // parallel.num_processes()
+    )
 
 
 def share(whole: TensorDict | Tensor) -> TensorDict | Tensor:
     """What this process has of a joint batch or rollout."""
-    return whole.chunk(parallel.count())[parallel.rank()]
+    return whole.chunk(parallel.num_processes())[parallel.rank()]
 
 
 def make_learner(losses: Losses = OF_STATE) -> WorldModelLearner:
@@ -128,7 +130,7 @@ def train_a_little(config: Losses, updates: int = 3) -> dict[str, Tensor]:
 
 def updates_of_shares(folder: Path) -> None:
     for name, config in CONFIGS.items():
-        torch.save(train_a_little(config), folder / f"{name}_{parallel.count()}_{parallel.rank()}.pt")
+        torch.save(train_a_little(config), folder / f"{name}_{parallel.num_processes()}_{parallel.rank()}.pt")
 
 
 def exchanges(folder: Path) -> None:
@@ -137,17 +139,17 @@ def exchanges(folder: Path) -> None:
     parallel.average_(values)
     assert values[0].tolist() == [[0.5, 0.5], [0.5, 0.5]] and values[1] == 1.5
     assert parallel.total(torch.tensor([1.0, rank])).tolist() == [2.0, 1.0]
-    assert parallel.gathered(torch.full((1, 2), rank), dim=1).tolist() == [[0, 0, 1, 1]]
+    assert parallel.all_gather(torch.full((1, 2), rank), dim=1).tolist() == [[0, 0, 1, 1]]
     rows = TensorDict({"return": torch.arange(rank + 1)}, [rank + 1])
-    assert parallel.gathered_rows(rows)["return"].tolist() == [0, 0, 1]
-    assert parallel.gathered_rows(rows[: 1 - rank])["return"].tolist() == [0], "one process may have none"
-    assert parallel.agreed({"path": rank}) == {"path": 0}
-    assert parallel.largest(rank) == 1
+    assert parallel.all_gather_rows(rows)["return"].tolist() == [0, 0, 1]
+    assert parallel.all_gather_rows(rows[: 1 - rank])["return"].tolist() == [0], "one process may have none"
+    assert parallel.broadcast({"path": rank}) == {"path": 0}
+    assert parallel.all_reduce_max(rank) == 1
     parallel.check_same([torch.ones(3)])
     with pytest.raises(RuntimeError, match="no longer the same"):
         parallel.check_same([torch.ones(3) + 1e-7 * rank])
     with pytest.raises((RuntimeError, OSError), match="full"):
-        parallel.together(lambda: fail("disk full") if rank else None)
+        parallel.run_in_all(lambda: fail("disk full") if rank else None)
 
 
 def fail(words: str) -> None:
@@ -180,7 +182,7 @@ def stop_at_once(folder: Path) -> None:
 
 
 def signal_at_one(folder: Path) -> None:
-    with GracefulExit(agree=parallel.largest) as stop:
+    with GracefulExit(agree=parallel.all_reduce_max) as stop:
         assert not stop.requested
         if parallel.rank():
             os.kill(os.getpid(), 15)
@@ -189,7 +191,7 @@ def signal_at_one(folder: Path) -> None:
 
 
 def make_share_of_replay(total_worlds: int = 8, held_out: int = 1) -> StreamReplay:
-    worlds = total_worlds // parallel.count()
+    worlds = total_worlds // parallel.num_processes()
     held_out = held_out if parallel.is_first() else 0
     seed = parallel.rank()
     return make_replay(20 * worlds, worlds, 2, 4, seed=seed, observation_keys=["pixels"], held_out=held_out)
@@ -227,7 +229,7 @@ def save_shares(folder: Path) -> None:
     checkpoints = RunCheckpoints(folder, parts, own=["replay"])
     with pytest.raises(RunCheckpointError, match="full"):
         checkpoints.save(130)
-    parallel.together(lambda: None)  # the first has cleared it away
+    parallel.run_in_all(lambda: None)  # the first has cleared it away
     assert [path.name for path in (folder / "checkpoints").iterdir()] == ["checkpoint-000000000120"]
 
 
@@ -247,7 +249,7 @@ def load_shares(folder: Path) -> None:
     replay, counters = make_share_of_replay(), {"env_steps": 0}
     RunCheckpoints(folder, {"counters": counters, "replay": replay}, own=["replay"]).load()
     joint, number = left[0] + left[1], replay.num_streams
-    skip = (parallel.count() - 1 - parallel.rank()) * number
+    skip = (parallel.num_processes() - 1 - parallel.rank()) * number
     assert contents(replay) == joint[skip : skip + number] and counters == {"env_steps": 120}
     assert len(replay) == sum(map(len, joint[skip : skip + number]))
     replay.extend(flown_rollout(number, 3, 200))
@@ -284,21 +286,23 @@ def together(tmp_path: Path, processes: int, *works: Callable[[Path], None]) -> 
 
 def _meet(tmp_path: Path, works: list[str]) -> None:
     torch.set_num_threads(1)
-    parallel.join()
+    parallel.init()
     try:
         for work in works:
             globals()[work](tmp_path)
     finally:
-        parallel.leave()
+        parallel.destroy()
 
 
 def test_a_single_process_exchanges_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.delenv("WORLD_SIZE", raising=False)
-    parallel.join()
+    parallel.init()
     assert not torch.distributed.is_initialized()
     value = torch.ones(2)
-    assert parallel.total(value) is value and parallel.gathered(value, 0) is value and parallel.agreed(value) is value
-    assert (parallel.count(), parallel.rank(), parallel.is_first()) == (1, 0, True)
+    assert (
+        parallel.total(value) is value and parallel.all_gather(value, 0) is value and parallel.broadcast(value) is value
+    )
+    assert (parallel.num_processes(), parallel.rank(), parallel.is_first()) == (1, 0, True)
 
 
 def test_processes_that_cannot_meet_are_told_how(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -306,7 +310,7 @@ def test_processes_that_cannot_meet_are_told_how(monkeypatch: pytest.MonkeyPatch
     for name in ("RANK", "MASTER_ADDR", "MASTER_PORT"):
         monkeypatch.delenv(name, raising=False)
     with pytest.raises(ValueError, match=r"WORLD_SIZE=2.*torchrun --nproc-per-node=N"):
-        parallel.join()
+        parallel.init()
 
 
 @pytest.mark.slow

@@ -6,7 +6,7 @@ Names are imported on first use: TorchRL and dm_control take seconds to import, 
 import importlib
 from typing import TYPE_CHECKING, Any
 
-from dreamer_racing.envs.gl_variables import heed_variables
+from dreamer_racing.envs.gl_variables import validate_gl_variables
 
 if TYPE_CHECKING:
     from dreamer_racing.envs.control_suite import ControlSuiteEnv as ControlSuiteEnv
@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from dreamer_racing.envs.tracks import load_track as load_track
     from dreamer_racing.envs.worlds import RaceWorlds as RaceWorlds
 
-heed_variables()  # before anything here imports MuJoCo
+validate_gl_variables()  # before anything here imports MuJoCo
 
 _HOMES = {
     "Camera": "simulator.scene",

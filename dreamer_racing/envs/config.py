@@ -16,10 +16,10 @@ from dreamer_racing.envs.worlds import ACTION_SIZE, RaceWorlds
 from dreamer_racing.settings import COUNT, NOT_NEGATIVE, POSITIVE, SHARE, Range, setting
 
 SUITES = ("race", "dmc")
-EVERYWHERE = ("suite", "num_envs", "device", "episode_steps", "from_pixels", "image_size")
+ALL_SUITES = ("suite", "num_envs", "device", "episode_steps", "from_pixels", "image_size")
 """Settings that apply to every suite."""
 MISSING = "???"  # OmegaConf's marker of a mandatory value; this package does not import OmegaConf
-IN_TRAINING = (
+TRAINING_ONLY = (
     "episode_steps", "start_beyond_gate", "start_at_gate", "start_on_line", "miss_radius", "action_change_weight",
     "looks",
 )  # fmt: skip
@@ -68,18 +68,18 @@ class EnvConfig:
         return Camera(self.image_size, self.image_size, tilt=self.camera_tilt, rate=self.camera_rate)
 
     @property
-    def measured(self) -> str | None:
+    def imu_argument(self) -> str | None:
         """The `imu` argument of `DroneRacingEnv`."""
         return None if self.imu == "none" else self.imu
 
     def arguments(self) -> dict[str, Any]:
         """Return the arguments of every `DroneRacingEnv`, for training and evaluation, without the track."""
         same = ("preset", "renderer", "control_rate", "from_pixels", "reward", "vector", "device")
-        return {"camera": self.camera, "imu": self.measured, **{name: getattr(self, name) for name in same}}
+        return {"camera": self.camera, "imu": self.imu_argument, **{name: getattr(self, name) for name in same}}
 
     def training_arguments(self) -> dict[str, Any]:
         """Return the further arguments of a training `DroneRacingEnv`."""
-        return {name: getattr(self, name) for name in IN_TRAINING}
+        return {name: getattr(self, name) for name in TRAINING_ONLY}
 
     def check(self) -> None:
         """Refuse an unsupported device and settings that do not apply to the suite.
@@ -99,7 +99,7 @@ class EnvConfig:
         if race:
             return
         for name, usual in vars(EnvConfig()).items():
-            if name not in EVERYWHERE and (value := getattr(self, name)) != usual:
+            if name not in ALL_SUITES and (value := getattr(self, name)) != usual:
                 raise ValueError(f"env.{name}={value} is for races, and env.suite={self.suite}: leave it at {usual}.")
 
     def check_race(self, track: Track) -> None:
@@ -113,17 +113,17 @@ class EnvConfig:
         try:
             at_control_rate(load_preset(self.preset), self.control_rate)
             frame_interval(Camera(rate=self.camera_rate), self.control_rate)
-            load_imu(self.measured, self.from_pixels)
-            self.try_own(track)
+            load_imu(self.imu_argument, self.from_pixels)
+            self.check_custom_functions(track)
             GateSweeper(track, miss_radius=self.miss_radius)
         except ValueError as error:
             raise ValueError(f"env.{error}") from error
 
-    def try_own(self, track: Track) -> None:
+    def check_custom_functions(self, track: Track) -> None:
         """Check user-defined reward and vector functions by running them for one step."""
         if self.reward is None and self.vector is None:
             return
-        if self.vector is not None and self.measured:
+        if self.vector is not None and self.imu_argument:
             raise ValueError("vector and env.imu: agents see one set of numbers, leave one of them out.")
         own: dict[str, Any] = {name: getattr(self, name) for name in ("control_rate", "device", "reward", "vector")}
         worlds = RaceWorlds(track, 2, self.preset, from_pixels=False, **own)

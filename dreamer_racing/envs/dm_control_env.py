@@ -42,7 +42,7 @@ from dreamer_racing.envs.drone.quadrotor import Quadrotor, wrong_action_type
 from dreamer_racing.envs.drone.rotation import rotate_inverse
 from dreamer_racing.envs.imu import Imu, ImuErrors, load_imu
 from dreamer_racing.envs.own import (
-    OwnFunction,
+    CustomFunction,
     RaceState,
     RaceStates,
     RewardFunction,
@@ -231,8 +231,8 @@ class Physics(mujoco.Physics):
         """Angular velocity (3,) in the body frame, rad/s."""
         return self.data.qvel[3:6].copy()
 
-    def feel(self) -> Tensor:
-        """Return what an ideal IMU at the drone's centre measures, (1, 6), as `Simulator.feel`."""
+    def ideal_imu(self) -> Tensor:
+        """Return what an ideal IMU at the drone's centre measures, (1, 6), as `Simulator.ideal_imu`."""
         rates, attitude, velocity = (
             torch.from_numpy(part()) for part in (self.body_rates, self.attitude, self.linear_velocity)
         )
@@ -346,8 +346,8 @@ class DroneRace(base.Task):
         self._starts = StartSampler(track, self._generator, dtype=torch.float64)
         self._invalid_action = False
         cpu = torch.device("cpu")
-        self._own_reward = None if reward is None else OwnFunction("reward", reward, 1, cpu)
-        self._own_vector = None if vector is None else OwnFunction("vector", vector, 1, cpu)
+        self._custom_reward = None if reward is None else CustomFunction("reward", reward, 1, cpu)
+        self._custom_vector = None if vector is None else CustomFunction("vector", vector, 1, cpu)
         self._states = RaceStates(self.race, RaceVector(track))
         self._action = torch.zeros(1, ACTION_SIZE)  # last applied action
         self._before: RaceState | None = None  # state before the current step
@@ -372,7 +372,7 @@ class DroneRace(base.Task):
         self._action = torch.zeros(1, ACTION_SIZE)
         self._image_age = self._frame_interval
         if self._imu_errors is not None:
-            self._imu = Imu(self._imu_errors, physics.feel, self._generator)
+            self._imu = Imu(self._imu_errors, physics.ideal_imu, self._generator)
             self._imu.begin(torch.ones(1, dtype=torch.bool))
 
     def before_step(self, action: np.ndarray, physics: Physics) -> None:
@@ -392,7 +392,7 @@ class DroneRace(base.Task):
             )
         self._invalid_action = not np.isfinite(action).all()
         flown = np.nan_to_num(action.astype(np.float64), nan=0.0, posinf=0.0, neginf=0.0)
-        if self._own_reward is not None:
+        if self._custom_reward is not None:
             self._before = self._race_state(physics)
         self._action = torch.from_numpy(flown).float().clamp(-1.0, 1.0).unsqueeze(0)
         physics.command(flown)
@@ -404,9 +404,9 @@ class DroneRace(base.Task):
             self._imu.step()
         body_rates = torch.from_numpy(physics.body_rates()).unsqueeze(0)
         self.outcome = self.race.step(physics.path(), body_rates, torch.tensor([self._invalid_action]))
-        if self._own_reward is not None and self._before is not None:
+        if self._custom_reward is not None and self._before is not None:
             transition = Transition(self._before, self._race_state(physics), self.outcome)
-            self.outcome = replace(self.outcome, reward_base=self._own_reward.rewards(transition))
+            self.outcome = replace(self.outcome, reward_base=self._custom_reward.rewards(transition))
 
     def _race_state(self, physics: Physics) -> RaceState:
         """Return the state that user-defined functions are given."""
@@ -424,8 +424,8 @@ class DroneRace(base.Task):
         )
         if self._imu is not None:
             observation["imu"] = self._imu.sample[0].numpy()
-        if self._own_vector is not None:
-            observation["vector"] = self._own_vector.vector(self._race_state(physics))[0].numpy()
+        if self._custom_vector is not None:
+            observation["vector"] = self._custom_vector.vector(self._race_state(physics))[0].numpy()
         if self._camera is not None:
             observation["pixels"] = self._look(physics)
         return observation

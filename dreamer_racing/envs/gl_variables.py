@@ -15,7 +15,7 @@ logger = logging.getLogger(__name__)
 
 VARIABLES = ("MUJOCO_GL", "PYOPENGL_PLATFORM", "MUJOCO_EGL_DEVICE_ID")
 
-refused: dict[str, str] = {}
+unset_variables: dict[str, str] = {}
 """Settings that were unset, as `NAME=value`, and the reason for each."""
 
 
@@ -46,20 +46,20 @@ def imports_with_variable(name: str) -> bool:
         if module.partition(".")[0] == "OpenGL":  # is bound to the platform of its first import
             del sys.modules[module]
     setting = f"{variable}={refusal}"
-    if setting not in refused:
+    if setting not in unset_variables:
         package = name.partition(".")[0]
         logger.warning("%s is left out of account: %s cannot be imported with it (%s).", setting, package, reason)
-    refused[setting] = reason
+    unset_variables[setting] = reason
     return False
 
 
-def heed_variables() -> None:
+def validate_gl_variables() -> None:
     """Import MuJoCo now if `MUJOCO_GL` is set, so that a bad value cannot break a later import."""
     while "MUJOCO_GL" in os.environ and "mujoco" not in sys.modules:
         imports_with_variable("mujoco")  # each failure unsets one variable, so the loop ends
 
 
-def in_the_way(backend: str) -> str:
+def describe_conflicts(backend: str) -> str:
     """Name the variables that may keep a backend from starting: ` (PYOPENGL_PLATFORM=glx is set)`, or ""."""
     values = {name: os.environ[name] for name in VARIABLES if os.environ.get(name)}
     named = [f"{name}={value}" for name, value in values.items() if value != backend]

@@ -181,7 +181,7 @@ class GymWorlds:
         Raises:
             ResetNeeded: a mask was given before the first reset of all environments.
         """
-        if mask is not None and not self.worlds.begun:
+        if mask is not None and not self.worlds.has_reset:
             raise gymnasium.error.ResetNeeded(
                 f"The first reset() begins {int(mask.sum())} of {len(mask)} episodes: reset all, without a reset_mask, "
                 "before a part."
@@ -195,7 +195,7 @@ class GymWorlds:
             ResetNeeded: no episode has begun.
             TypeError, ValueError: actions of a wrong type or shape.
         """
-        if not self.worlds.begun:
+        if not self.worlds.has_reset:
             raise gymnasium.error.ResetNeeded("step() before the first reset(): no episode has begun.")
         actions = np.asarray(actions)
         if actions.dtype.kind != "f":

@@ -9,7 +9,7 @@ from typing import Any
 from torch import Tensor
 
 
-class HeldFrames:
+class FrameHold:
     """Holds the newest frame of each of N cameras.
 
     All cameras take their frames in the same control steps, so that they are rendered in one batch. A camera whose

@@ -77,18 +77,18 @@ class Imu:
 
     Args:
         errors: their error model.
-        feel: returns the true body rates and specific force (N, 6) at the drones' centres.
+        ideal_imu: returns the true body rates and specific force (N, 6) at the drones' centres.
         generator: source of noise and biases, on the device of those values.
     """
 
-    def __init__(self, errors: ImuErrors, feel: Callable[[], Tensor], generator: torch.Generator) -> None:
-        self._errors, self._feel, self._generator = errors, feel, generator
-        felt = feel()
-        self._bias = torch.zeros_like(felt)
-        self._samples = felt.new_zeros((errors.delay + 1, *felt.shape))  # newest first
+    def __init__(self, errors: ImuErrors, ideal_imu: Callable[[], Tensor], generator: torch.Generator) -> None:
+        self._errors, self._ideal_imu, self._generator = errors, ideal_imu, generator
+        measurement = ideal_imu()
+        self._bias = torch.zeros_like(measurement)
+        self._samples = measurement.new_zeros((errors.delay + 1, *measurement.shape))  # newest first
 
         def both(gyro: float, accelerometer: float) -> Tensor:
-            return felt.new_tensor([gyro] * 3 + [accelerometer] * 3)
+            return measurement.new_tensor([gyro] * 3 + [accelerometer] * 3)
 
         self._bias_std = both(errors.gyro_bias, errors.accelerometer_bias)
         self._noise_std = both(errors.gyro_noise, errors.accelerometer_noise)
@@ -112,11 +112,11 @@ class Imu:
 
     def _measure(self) -> Tensor:
         """Return a noisy, biased and clipped measurement (N, 6)."""
-        felt = self._feel()
+        measurement = self._ideal_imu()
         if self._errors.gyro_noise or self._errors.accelerometer_noise:
-            felt = felt + self._noise_std * self._normal()
-        felt = (felt + self._bias).nan_to_num(0.0)  # a drone's state may be non-finite
-        return torch.minimum(torch.maximum(felt, -self._range), self._range)
+            measurement = measurement + self._noise_std * self._normal()
+        measurement = (measurement + self._bias).nan_to_num(0.0)  # a drone's state may be non-finite
+        return torch.minimum(torch.maximum(measurement, -self._range), self._range)
 
     def _normal(self) -> Tensor:
         like = self._bias

@@ -97,7 +97,7 @@ class RaceStates:
         )
 
 
-class OwnFunction:
+class CustomFunction:
     """A user-defined reward or vector function whose return values are checked.
 
     On a CUDA device, non-finite values are reported only when `check` is called, to avoid a synchronisation per step.

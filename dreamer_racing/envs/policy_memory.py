@@ -38,7 +38,7 @@ class RaceWithMemory(TransformedEnv):
 
     def maybe_reset(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Reset in place the environments whose episode ended."""
-        if len(self.transform) > 2 or not self.base_env.is_of_a_step(tensordict):
+        if len(self.transform) > 2 or not self.base_env.has_step_keys(tensordict):
             return super().maybe_reset(tensordict)
         ended = tensordict.get("done").clone()
         return self.base_env.maybe_reset(tensordict).set("is_init", ended)

@@ -96,7 +96,7 @@ class DroneRacingEnv(EnvBase):
             observation["pixels"] = Bounded(
                 0, 255, (*n, camera.height, camera.width, 3), dtype=torch.uint8, device=self.device
             )
-        if not self.from_pixels or self.worlds.own_vector is not None:
+        if not self.from_pixels or self.worlds.custom_vector is not None:
             observation["vector"] = number(self.worlds.vector_size)
         if self.worlds.imu is not None:
             observation["imu"] = number(IMU_SIZE)
@@ -146,7 +146,7 @@ class DroneRacingEnv(EnvBase):
         rows that were reset. All other keys, of the race or of a policy, are zero where an episode begins (``EnvBase``:
         unless all begin together). On a CUDA device it synchronises once, to count the ended episodes.
         """
-        if not self.is_of_a_step(tensordict):
+        if not self.has_step_keys(tensordict):
             return super().maybe_reset(tensordict)
         ended = tensordict.get("done").squeeze(-1)
         rows = ended.nonzero().squeeze(-1)
@@ -162,7 +162,7 @@ class DroneRacingEnv(EnvBase):
                 tensordict.set(key, value.masked_fill(ended.view(-1, *[1] * (value.ndim - 1)), 0))
         return tensordict.update(seen)
 
-    def is_of_a_step(self, tensordict: TensorDictBase) -> bool:
+    def has_step_keys(self, tensordict: TensorDictBase) -> bool:
         """Return whether data have the keys that a step of this environment returns."""
         return "done" in tensordict and not (self.from_pixels and "pixels" not in tensordict)
 
@@ -178,10 +178,10 @@ class DroneRacingEnv(EnvBase):
     def _observe(self) -> dict[str, Any]:
         """Return the current observations without images."""
         data: dict[str, Any] = {} if self.worlds.imu is None else {"imu": self.worlds.imu.sample}
-        if not self.from_pixels or self.worlds.own_vector is not None:
+        if not self.from_pixels or self.worlds.custom_vector is not None:
             data["vector"] = self.worlds.observed_vector()
         if self.privileged:
-            race = data["vector"] if "vector" in data and self.worlds.own_vector is None else self.worlds.vector()
+            race = data["vector"] if "vector" in data and self.worlds.custom_vector is None else self.worlds.vector()
             data["privileged"] = self._group({**self.worlds.privileged(), "vector": race})
         return data
 

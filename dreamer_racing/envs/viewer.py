@@ -52,7 +52,7 @@ class RaceWindow:
         from mujoco import viewer
 
         self._track, self._control_dt = worlds.track, worlds.parameters.control_dt
-        self._model = _scene_to_look_into(worlds)
+        self._model = _compile_open_scene(worlds)
         self._data = mujoco.MjData(self._model)
         self._due = time.monotonic()
         before = set(threading.enumerate())
@@ -114,7 +114,7 @@ class RaceWindow:
         return mujoco.MjrRect(window.width - width - INSET_MARGIN, INSET_MARGIN, width, height), large
 
 
-def _scene_to_look_into(worlds: RaceWorlds) -> mujoco.MjModel:
+def _compile_open_scene(worlds: RaceWorlds) -> mujoco.MjModel:
     """Compile the scene of these worlds with hidden walls and ceiling."""
     spec = build_scene(worlds.track, worlds.parameters, worlds.camera)
     for geom in spec.geoms:

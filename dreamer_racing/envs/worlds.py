@@ -19,9 +19,9 @@ from dreamer_racing.envs.drone.parameters import (
     without_randomisation,
 )
 from dreamer_racing.envs.drone.quadrotor import wrong_action_type
-from dreamer_racing.envs.held_frames import HeldFrames
+from dreamer_racing.envs.held_frames import FrameHold
 from dreamer_racing.envs.imu import Imu, ImuErrors, load_imu
-from dreamer_racing.envs.own import OwnFunction, RaceState, RaceStates, RewardFunction, Transition, VectorFunction
+from dreamer_racing.envs.own import CustomFunction, RaceState, RaceStates, RewardFunction, Transition, VectorFunction
 from dreamer_racing.envs.race.race import (
     EPISODE_TIME,
     EVALUATION_TIME,
@@ -219,9 +219,9 @@ class RaceWorlds:
         self._make_numbers(errors, vector)
         self._make_rewards(action_change_weight, reward)
         self._starts = self._make_starts(start_beyond_gate, start_at_gate, start_noise, start_on_line)
-        self._held = HeldFrames(interval, self._draw) if from_pixels and interval > 1 else None
+        self._held = FrameHold(interval, self._draw) if from_pixels and interval > 1 else None
         self._graphs: dict[bool, GraphedFunction] = {}  # CUDA graphs of a control step, by whether it renders
-        self.begun = False
+        self.has_reset = False
 
     def _make_race(self, weights: RewardWeights | None, episode_steps: int | None, miss_radius: float) -> Race:
         """Make the race rules for training or evaluation."""
@@ -243,21 +243,21 @@ class RaceWorlds:
         """Make the sources of vector observations: the IMU, and the race vector or a user-defined function."""
         if vector is not None and errors is not None:
             raise ValueError("imu= and vector=: agents see one set of numbers, leave one of them out.")
-        self.imu = None if errors is None else Imu(errors, self.simulator.feel, self._generator)
+        self.imu = None if errors is None else Imu(errors, self.simulator.ideal_imu, self._generator)
         self.race_vector = RaceVector(self.track, self.device, self.dtype)
         self._states = RaceStates(self.race, self.race_vector)
         self._last_action = torch.zeros(self.num_envs, ACTION_SIZE, device=self.device)
-        self.own_vector, self.vector_size = None, RACE_VECTOR_SIZE
+        self.custom_vector, self.vector_size = None, RACE_VECTOR_SIZE
         if vector is not None:
-            self.own_vector = OwnFunction("vector", vector, self.num_envs, self.device)
+            self.custom_vector = CustomFunction("vector", vector, self.num_envs, self.device)
             self.vector_size = self.observed_vector().shape[1]
 
     def _make_rewards(self, weight: float, reward: str | RewardFunction | None) -> None:
         """Set b₃, which applies only in training, and the user-defined reward function, if any."""
         check_setting("action_change_weight", weight, NOT_NEGATIVE)
         self.action_change_weight = 0.0 if self.evaluation else float(weight)
-        self.own_reward = None if reward is None else OwnFunction("reward", reward, self.num_envs, self.device)
-        self._remembers = bool(self.action_change_weight or self.own_reward or self.own_vector)
+        self.custom_reward = None if reward is None else CustomFunction("reward", reward, self.num_envs, self.device)
+        self._tracks_last_action = bool(self.action_change_weight or self.custom_reward or self.custom_vector)
 
     def _make_starts(self, beyond_gate: float, at_gate: float, noise: float, on_line: float) -> StartSampler:
         """Make the sampler of start poses, and plan the racing line if episodes begin on it."""
@@ -320,7 +320,7 @@ class RaceWorlds:
             RuntimeError: this process was forked from the one that made the worlds.
         """
         self._check_process()
-        for own in filter(None, (self.own_reward, self.own_vector)):
+        for own in filter(None, (self.custom_reward, self.custom_vector)):
             own.check()
         whole = mask is None
         if mask is None:
@@ -328,8 +328,8 @@ class RaceWorlds:
         start = self._starts.sample(self.num_envs, self.evaluation)
         self.simulator.reset(mask, start.position, start.attitude, start.linear_velocity)
         self.race.begin(mask, start.position, start.target_gate)
-        self._images, self.begun = None, True
-        if self._remembers:
+        self._images, self.has_reset = None, True
+        if self._tracks_last_action:
             self._last_action.masked_fill_(mask.unsqueeze(-1), 0.0)
         if self._held is not None:
             together = whole or (self.device.type == "cpu" and bool(mask.all()))  # on CUDA it would synchronise
@@ -350,7 +350,7 @@ class RaceWorlds:
             ValueError: wrong shape or device.
         """
         self._check_process()
-        if not self.begun:
+        if not self.has_reset:
             raise RuntimeError("Step before the first reset: call reset() to begin episodes.")
         if not action.is_floating_point():
             raise wrong_action_type(action.dtype)
@@ -383,16 +383,16 @@ class RaceWorlds:
         invalid = ~action.isfinite().all(dim=1)
         flown = action.nan_to_num(0.0, 0.0, 0.0)
         goes_on = self.race.step_count > 0  # the first step of an episode has no previous action
-        before = None if self.own_reward is None else self.race_state()
+        before = None if self.custom_reward is None else self.race_state()
         path = self.simulator.step(flown)
         outcome = self.race.step(path, self.simulator.state.body_rates, invalid)
-        if not self._remembers:
+        if not self._tracks_last_action:
             return outcome
         flown = flown.float().clamp(-1.0, 1.0)
         change = (flown - self._last_action).square().sum(1).masked_fill(~goes_on | outcome.terminated, 0.0)
         self._last_action.copy_(flown)
-        if self.own_reward is not None and before is not None:
-            rewards = self.own_reward.rewards(Transition(before, self.race_state(), outcome))
+        if self.custom_reward is not None and before is not None:
+            rewards = self.custom_reward.rewards(Transition(before, self.race_state(), outcome))
             outcome = replace(outcome, reward_base=rewards)
         if not self.action_change_weight:
             return outcome
@@ -412,10 +412,10 @@ class RaceWorlds:
         try:
             graph = GraphedFunction(fly_and_draw, action)
         except RuntimeError as error:
-            if self.own_reward is None or is_out_of_memory(error):
+            if self.custom_reward is None or is_out_of_memory(error):
                 raise
             raise RuntimeError(
-                f"{self.own_reward.name} cannot be captured as a CUDA graph. It must compute with tensors alone: no "
+                f"{self.custom_reward.name} cannot be captured as a CUDA graph. It must compute with tensors alone: no "
                 f".item(), no if on a number, no index by a mask, no tensor of Python's numbers. CUDA says: {error}"
             ) from error
         self.load_state_dict(before)
@@ -441,7 +441,7 @@ class RaceWorlds:
         looks = self.simulator.looks
         return images if looks is None else looks.add_noise(images)
 
-    def picture(self, position: Tensor, attitude: Tensor) -> Tensor:
+    def render_at(self, position: Tensor, attitude: Tensor) -> Tensor:
         """Return images uint8 (M, height, width, 3) at given positions (M, 3), m, and attitudes (M, 4), wxyz.
 
         They are rendered in the halls of worlds 0, 1, …; the state of the worlds is restored afterwards.
@@ -478,7 +478,7 @@ class RaceWorlds:
 
     def observed_vector(self) -> Tensor:
         """Return the observation `vector`, float32 (N, V): the user-defined function's, or the race vector."""
-        return self.vector() if self.own_vector is None else self.own_vector.vector(self.race_state())
+        return self.vector() if self.custom_vector is None else self.custom_vector.vector(self.race_state())
 
     def state_dict(self) -> dict[str, Any]:
         """Return the complete state that future steps and episodes depend on, for `torch.save`."""
@@ -486,7 +486,7 @@ class RaceWorlds:
             "simulator": self.simulator.state_dict(),
             "race": self.race.state_dict(),
             "generator": self._generator.get_state(),
-            **({"last_action": self._last_action.clone()} if self._remembers else {}),
+            **({"last_action": self._last_action.clone()} if self._tracks_last_action else {}),
             **({} if self._held is None else {"frames": self._held.state_dict()}),
             **({} if self.imu is None else {"imu": self.imu.state_dict()}),
         }
@@ -506,9 +506,9 @@ class RaceWorlds:
             raise ValueError("The saved worlds had another camera_rate than these: resume with theirs.")
         if ("imu" in state_dict) != (self.imu is not None):
             raise ValueError("The saved worlds had another imu than these: resume with theirs.")
-        if self._remembers and "last_action" in state_dict:
+        if self._tracks_last_action and "last_action" in state_dict:
             self._last_action.copy_(state_dict["last_action"])
-        self.begun = True
+        self.has_reset = True
         generator = state_dict["generator"].cpu()
         if generator.shape != self._generator.get_state().shape:
             saved_on = "cpu" if self.device.type == "cuda" else "cuda"

@@ -111,7 +111,7 @@ class BelievedView:
         position, attitude, misfit = (torch.stack(parts) for parts in zip(*poses, strict=True))
         misfit[1:] += self.PREFERENCE
         best, rows = misfit.argmin(0), torch.arange(len(vector), device=vector.device)
-        images = self._worlds.picture(position[best, rows], attitude[best, rows])
+        images = self._worlds.render_at(position[best, rows], attitude[best, rows])
         return images.unflatten(0, belief.shape[:2])
 
 

@@ -29,7 +29,8 @@ logger = logging.getLogger(__name__)
 
 SEEDS_APART = 1_000_000
 """Difference between the seeds of two workers."""
-KNOCK, TRY = 5.0, 120.0  # timeouts, s: for a cluster's head to answer, and for each node to try out a worker
+CONNECT_TIMEOUT = 5.0  # s for a cluster's head to answer
+PROBE_TIMEOUT = 120.0  # s for each node to try out a worker
 
 
 @dataclass
@@ -98,7 +99,7 @@ def _knock(address: str) -> None:
     """Raise ``OSError`` if nothing answers at ``host:port``; Ray itself would retry for minutes."""
     host, colon, port = address.rpartition(":")
     if colon and port.isdigit() and "/" not in host:
-        socket.create_connection((host.strip("[]"), int(port)), KNOCK).close()
+        socket.create_connection((host.strip("[]"), int(port)), CONNECT_TIMEOUT).close()
 
 
 def leave() -> None:
@@ -236,10 +237,12 @@ def check_nodes(share: WorkersConfig, make_env: Callable[[], EnvBase], policy: D
             asked.append((node["NodeManagerHostname"], options.remote(make_env, policy)))
     for name, answer in asked:
         try:
-            found = ray.get(answer, timeout=TRY)
+            found = ray.get(answer, timeout=PROBE_TIMEOUT)
         except ray.exceptions.GetTimeoutError:
             ray.cancel(answer, force=True)
-            logger.warning("node %s had no room within %.0f s to see whether a worker can be had there", name, TRY)
+            logger.warning(
+                "node %s had no room within %.0f s to see whether a worker can be had there", name, PROBE_TIMEOUT
+            )
             continue
         except ray.exceptions.RayError as error:
             raise ValueError(

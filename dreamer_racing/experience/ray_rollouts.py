@@ -33,7 +33,7 @@ from torchrl.envs import EnvBase
 
 from dreamer_racing.experience import ray_cluster
 from dreamer_racing.experience.ray_arrays import as_arrays, unpack_rollout
-from dreamer_racing.experience.ray_worker import Flight, Request
+from dreamer_racing.experience.ray_worker import Request, WorkerResult
 from dreamer_racing.experience.rollouts import Rollouts, WorkerError
 from dreamer_racing.modules import DreamerPolicy
 
@@ -44,7 +44,7 @@ logger = logging.getLogger(__name__)
 
 LOOK = 1.0  # s between checks whether workers have answered, or the run shall stop
 REMIND = 30.0  # s between log messages about late workers
-FAREWELL = 10.0  # s that a stopping run waits for the round in progress
+STOP_TIMEOUT = 10.0  # s that a stopping run waits for the round in progress
 
 
 class RayRollouts(Rollouts):
@@ -89,7 +89,7 @@ class RayRollouts(Rollouts):
         self._frames = collector.frames_per_batch * len(self._workers)
         check_interval(weight_interval, self._frames)
         self._interval, self._patience, self._leaves = weight_interval, patience, leaves
-        self._asked: list[Any] = []  # Ray references to `Flight`s, one for each worker
+        self._asked: list[Any] = []  # Ray references to `WorkerResult`s, one for each worker
         self._weights: Any = None  # a Ray reference
         self._taken_at = self._flown_with = 0  # env_steps when weights were taken: newest, of the round in progress
         self._all_flew = self._is_over = False
@@ -144,7 +144,10 @@ class RayRollouts(Rollouts):
             self._taken_at = self.rounds * self._frames
         settings = {name: attrgetter(name)(self._env) for name in self._settings}
         request = Request(number, [self._weights], self._taken_at, settings)
-        self._asked, self._flown_with = [worker.fly.remote(request) for worker in self._workers], self._taken_at
+        self._asked, self._flown_with = (
+            [worker.collect_rollout.remote(request) for worker in self._workers],
+            self._taken_at,
+        )
 
     def _receive(self) -> TensorDictBase | None:
         """Wait for the round in progress; return None if there is none, or if it is abandoned because the run stops.
@@ -155,11 +158,11 @@ class RayRollouts(Rollouts):
         self._is_over = self._is_over or bool(asked)
         if not asked or not self._wait(asked):
             return None
-        flights = [_flight(worker, flight) for worker, flight in enumerate(asked)]
-        for worker, flight in enumerate(flights):
-            if flight.began and self._all_flew:
+        results = [_fetch(worker, answer) for worker, answer in enumerate(asked)]
+        for worker, result in enumerate(results):
+            if result.is_first and self._all_flew:
                 self.lost += 1
-                host, process = flight.process
+                host, process = result.process
                 logger.warning(
                     "worker %d was lost in round %d: process %d on %s took its place, and its worlds began anew",
                     worker,
@@ -168,10 +171,10 @@ class RayRollouts(Rollouts):
                     host,
                 )
         self._all_flew, self._is_over = True, False
-        self.processes = [flight.process for flight in flights]
-        self.seconds = max(flight.seconds for flight in flights)
+        self.processes = [result.process for result in results]
+        self.seconds = max(result.seconds for result in results)
         self.weights_age = (self.rounds + 1) * self._frames - self._flown_with
-        return unpack_rollout(*(flight.rollout for flight in flights))
+        return unpack_rollout(*(result.rollout for result in results))
 
     def _wait(self, asked: list[Any]) -> bool:
         """Wait until every worker has answered; return False if the run stops and they take too long.
@@ -184,8 +187,8 @@ class RayRollouts(Rollouts):
         begun, reminded, pending = time.monotonic(), 0.0, asked
         while pending:
             _, pending = ray.wait(asked, num_returns=len(asked), timeout=min(LOOK, self._patience))
-            waited, late = time.monotonic() - begun, _listed([asked.index(flight) for flight in pending])
-            if pending and self.stopping() and waited >= FAREWELL:
+            waited, late = time.monotonic() - begun, _listed([asked.index(answer) for answer in pending])
+            if pending and self.stopping() and waited >= STOP_TIMEOUT:
                 logger.warning("worker %s did not answer for %.0f s: this round is given up", late, waited)
                 return False
             if pending and waited >= self._patience:
@@ -200,7 +203,7 @@ class RayRollouts(Rollouts):
         return True
 
 
-def _flight(worker: int, asked: Any) -> Flight:
+def _fetch(worker: int, asked: Any) -> WorkerResult:
     """Fetch the answer of a worker.
 
     Raises:

@@ -39,18 +39,18 @@ class Request(NamedTuple):
     settings: Mapping[str, Any]
 
 
-class Flight(NamedTuple):
+class WorkerResult(NamedTuple):
     """Answer of a worker.
 
     Attributes:
         rollout: Packed rollout ``[N/W, T]``.
-        began: Whether it is the worker's first one, with freshly reset environments.
+        is_first: Whether it is the worker's first one, with freshly reset environments.
         process: Host and process ID.
         seconds: Time that the worker took for it.
     """
 
     rollout: Arrays
-    began: bool
+    is_first: bool
     process: tuple[str, int]
     seconds: float
 
@@ -71,9 +71,9 @@ class RayWorker(Collector):
         super().__init__(*args, **kwargs)
         self._seed = seed
         self._taken_at: int | None = None
-        self._flown: tuple[int, Flight] | None = None  # number and answer of the last round
+        self._flown: tuple[int, WorkerResult] | None = None  # number and answer of the last round
 
-    def fly(self, request: Request) -> Flight:
+    def collect_rollout(self, request: Request) -> WorkerResult:
         """Collect a rollout; if Ray lost the answer and repeats the request, return the same answer again."""
         if self._flown is not None and self._flown[0] == request.round:
             return self._flown[1]
@@ -81,8 +81,8 @@ class RayWorker(Collector):
         for name, value in request.settings.items():
             *path, attribute = name.split(".")
             setattr(attrgetter(".".join(path))(self.env.base_env) if path else self.env.base_env, attribute, value)
-        began = self._taken_at is None
-        if began:
+        is_first = self._taken_at is None
+        if is_first:
             self._begin((self._seed + request.round) % 2**32)
         if request.taken_at != self._taken_at:
             import ray
@@ -90,9 +90,9 @@ class RayWorker(Collector):
             self.update_policy_weights_(as_tensors(ray.get(request.weights[0])))
             self._taken_at = request.taken_at
         rollout, process = self.next(), (socket.gethostname(), os.getpid())
-        flight = Flight(pack_rollout(rollout), began, process, time.perf_counter() - start)
-        self._flown = request.round, flight
-        return flight
+        result = WorkerResult(pack_rollout(rollout), is_first, process, time.perf_counter() - start)
+        self._flown = request.round, result
+        return result
 
     def _begin(self, seed: int) -> None:
         """Seed and reset all environments; the global generator is this worker's alone, like its process."""

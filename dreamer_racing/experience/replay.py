@@ -195,7 +195,7 @@ class StreamReplay(TensorDictReplayBuffer):
         self._read_streams(path, state, range(self._writer.num_streams), first=0)
         self._rng.set_state(torch.tensor(state["generator"], dtype=torch.uint8))
 
-    def deal(self, paths: Sequence[str | Path], skip: int) -> None:
+    def load_shards(self, paths: Sequence[str | Path], skip: int) -> None:
         """Load this replay's number of streams from several saved replays, which are concatenated in their order.
 
         So streams can be redistributed to another number of replays. The random generator stays as it is.

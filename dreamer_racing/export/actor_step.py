@@ -109,7 +109,7 @@ class ActorStep(nn.Module):
 
     def act(self, observation: Tensor, h: Tensor, *more: Tensor) -> tuple[Tensor, Tensor]:
         """Return action ``(1, A)`` and next state ``(1, S)`` from the observation and the next belief ``(1, D)``."""
-        z = self.rssm.take_in(h, self._embed(observation, *more), deterministic=True)
+        z = self.rssm.posterior_state(h, self._embed(observation, *more), deterministic=True)
         return self.actor(join_features(h, z)).clipped_mean(), z
 
     def example_inputs(self) -> dict[str, Tensor]:

@@ -85,7 +85,7 @@ class RecurrentActor:
         self.reset()
 
     @property
-    def feels(self) -> bool:
+    def needs_imu(self) -> bool:
         """Whether the actor takes IMU measurements."""
         return "imu" in self._shapes
 
@@ -114,7 +114,7 @@ class RecurrentActor:
             observation: uint8 RGB image (height, width, 3), top row first, or float32 vector (V,), as the contract's
                 first input specifies.
             noise: Only for ``latent=sample``: uniform numbers in [0, 1), float32 (L, K); drawn here if None.
-            imu: Only for actors with an IMU (`feels`): body rates, rad/s, and specific force, m/s², FLU, float32 (6,).
+            imu: Only for actors with an IMU (`needs_imu`): body rates, rad/s, and specific force, m/s², FLU, float32 (6,).
 
         Returns:
             Action, float32 (A,) in [−1, 1]; `setpoint` converts it to units.
@@ -127,7 +127,7 @@ class RecurrentActor:
             self._observed: self._checked(self._observed, observation, self._dtype),
             "is_init": np.array([self.is_init]),
         }
-        if self.feels:
+        if self.needs_imu:
             feed["imu"] = self._checked("imu", imu, np.dtype(np.float32))
         elif imu is not None:
             raise ValueError("imu: this actor has none, by its contract.")
@@ -424,7 +424,7 @@ def main() -> None:
         parser.error(str(error))
     entry = actor.contract["inputs"][0]
     seen = np.random.default_rng(0).integers(0, 256, (arguments.steps, *entry["shape"][1:])).astype(entry["type"])
-    step = partial(actor.step, imu=np.zeros(6, np.float32)) if actor.feels else actor.step
+    step = partial(actor.step, imu=np.zeros(6, np.float32)) if actor.needs_imu else actor.step
     logger.info("onnxruntime, %d steps, %d thread(s): %s", arguments.steps, arguments.threads,
                 measure_latency(step, seen))  # fmt: skip
     if actor.in_parts:

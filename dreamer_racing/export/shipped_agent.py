@@ -209,7 +209,7 @@ def check_env(folder: str | Path, contract: dict[str, Any], env: DroneRacingEnv)
         "env.control_rate": (contract["control"]["rate_hz"], 1.0 / env.worlds.parameters.control_dt),
         "env.from_pixels": (camera is not None, env.from_pixels),
         "env.imu": ("exact" if "imu" in contract else "none", "exact" if env.worlds.imu is not None else "none"),
-        "env.vector": ("none", "none" if env.worlds.own_vector is None else "of your own"),
+        "env.vector": ("none", "none" if env.worlds.custom_vector is None else "of your own"),
     }
     if camera is not None and env.from_pixels:
         here = describe_camera(env.worlds.camera)

@@ -7,7 +7,7 @@ from queue import SimpleQueue
 from threading import Thread
 
 
-class Aside:
+class BackgroundWorker:
     """Runs tasks one after another in a background thread; the caller never waits.
 
     Args:
@@ -18,8 +18,8 @@ class Aside:
 
     Example:
         >>> done = []
-        >>> aside = Aside(most=2)
-        >>> aside.do(lambda: done.append(1)), aside.close(patience=1.0), done
+        >>> worker = BackgroundWorker(most=2)
+        >>> worker.submit(lambda: done.append(1)), worker.close(patience=1.0), done
         (True, True, [1])
     """
 
@@ -29,14 +29,14 @@ class Aside:
         self._waiting: SimpleQueue[Callable[[], object] | None] = SimpleQueue()
         self._thread: Thread | None = None  # started with the first task, so that a fork before that loses no thread
 
-    def do(self, thing: Callable[[], object]) -> bool:
+    def submit(self, task: Callable[[], object]) -> bool:
         """Queue a task; return whether it was accepted: not if the queue is full, a task failed, or this is closed."""
         if self.error is not None or self._closed or self._waiting.qsize() >= self._most:
             return False
         if self._thread is None:
             self._thread = Thread(target=self._work, daemon=True)
             self._thread.start()
-        self._waiting.put(thing)
+        self._waiting.put(task)
         return True
 
     def close(self, patience: float) -> bool:
@@ -49,9 +49,9 @@ class Aside:
         return not self._thread.is_alive() and self.error is None
 
     def _work(self) -> None:
-        while (thing := self._waiting.get()) is not None:
+        while (task := self._waiting.get()) is not None:
             try:
-                thing()
+                task()
             except Exception as error:
                 self.error = error
                 return

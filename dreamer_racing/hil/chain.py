@@ -18,7 +18,7 @@ from dreamer_racing.envs.tracks import Track
 from dreamer_racing.hil.battery import Battery, BatteryConfig, Reading
 from dreamer_racing.hil.camera import NoseCamera
 from dreamer_racing.hil.flyer import Flyer
-from dreamer_racing.hil.imu import ImuReading, unlike_rest
+from dreamer_racing.hil.imu import ImuReading, check_at_rest
 from dreamer_racing.hil.operator import Operator
 from dreamer_racing.hil.pose import PosePacket, Received
 from dreamer_racing.hil.progress import GateProgress
@@ -148,7 +148,7 @@ class FlightChain:
         clock: Determines the measurement times of poses.
         safety: Checks and limits each command.
         battery: Tracks its voltage; None if that is not used.
-        feels: Whether the flyer needs IMU samples.
+        needs_imu: Whether the flyer needs IMU samples.
     """
 
     def __init__(self, flyer: Flyer, track: Track, config: ChainConfig, camera: NoseCamera | None) -> None:
@@ -159,8 +159,8 @@ class FlightChain:
         self.battery = None if config.battery is None else Battery(config.battery)
         self._flyer, self._camera, self._config = flyer, camera, config
         self._frame_interval = 1 if flyer.camera is None else frame_interval(flyer.camera, flyer.rate)
-        self.feels = bool(getattr(flyer, "feels", False))
-        self._felt: ImuReading | None = None  # newest IMU sample
+        self.needs_imu = bool(getattr(flyer, "needs_imu", False))
+        self._newest_imu: ImuReading | None = None  # newest IMU sample
         self._image: np.ndarray | None = None  # shown to the flyer; None before a flight's first
         self._shown = 0  # ticks for which it has been shown
         drawn = None if camera is None else camera.camera
@@ -182,9 +182,9 @@ class FlightChain:
         """Render and run the flyer once before the first tick, because libraries are slow at first use."""
         level = np.array([1.0, 0.0, 0.0, 0.0])
         start = np.array(self._config.limits.start_position, float)
-        self._felt = ImuReading(0.0, np.array((0.0, 0.0, 0.0, 0.0, 0.0, GRAVITY)))
+        self._newest_imu = ImuReading(0.0, np.array((0.0, 0.0, 0.0, 0.0, 0.0, GRAVITY)))
         self._choose(Pose(0.0, start, level, np.zeros(3), np.zeros(3)))
-        self._felt = None
+        self._newest_imu = None
         self._begin()
 
     def tick(self, inputs: Inputs) -> Outputs:
@@ -198,7 +198,7 @@ class FlightChain:
             self.progress.update(pose, judged=pose is poses[-1])
         self._flying |= self._has_risen()
         pose = None if self._newest is None else extrapolate(self._newest, inputs.time)
-        numb = self._feel(inputs) if self.feels else None
+        imu_fault = self._check_imu(inputs) if self.needs_imu else None
         finish = self._gates_in_all is not None and len(self.progress.passes) >= self._gates_in_all
         tick = Tick(
             now=inputs.time,
@@ -208,7 +208,7 @@ class FlightChain:
             operator=inputs.operator,
             arm_requested=self._config.arm,
             # a silent IMU in flight leaves the setpoint out instead: safety holds, then cuts
-            contract_mismatch=self._mismatch if self.safety.armed else self._mismatch or numb,
+            contract_mismatch=self._mismatch if self.safety.armed else self._mismatch or imu_fault,
             loop_overrun=inputs.overrun,
             finish=finish,
             command_dropped=inputs.dropped,
@@ -217,9 +217,9 @@ class FlightChain:
         )
         findings = self.safety.examine(tick)
         # If safety cuts anyway, rendering and flyer are skipped.
-        setpoint, image, render_s, act_s = self._choose(None if numb or self.safety.cuts(findings) else pose)
+        setpoint, image, render_s, act_s = self._choose(None if imu_fault or self.safety.cuts(findings) else pose)
         verdict = self.safety.judge(tick._replace(setpoint=setpoint), findings)
-        self._lifting = tick.lift is not None and self.safety.lets_through
+        self._lifting = tick.lift is not None and self.safety.sends_setpoint
         self._flying = finish or (verdict.command.armed and (self._flying or self._has_moved()))
         measured = math.nan if self._newest is None else self._newest.time
         target, passes = self.progress.target, len(self.progress.passes)
@@ -263,20 +263,20 @@ class FlightChain:
         start = time.perf_counter()
         image = self._look(pose)
         drawn = time.perf_counter()
-        felt = () if not self.feels or self._felt is None else (self._felt.sample,)
+        imu = () if not self.needs_imu or self._newest_imu is None else (self._newest_imu.sample,)
         act: Callable[..., Setpoint] = self._flyer.act  # takes the IMU sample, too, if the flyer needs it
-        setpoint = act(pose, image, self.progress.target, *felt)
+        setpoint = act(pose, image, self.progress.target, *imu)
         render_s = 0.0 if self._shown else drawn - start
         return setpoint, image, render_s, time.perf_counter() - drawn
 
-    def _feel(self, inputs: Inputs) -> str | None:
+    def _check_imu(self, inputs: Inputs) -> str | None:
         """Store the newest IMU sample; return why the flyer cannot use it, None if it can."""
         if inputs.imu:
-            self._felt = inputs.imu[-1]
+            self._newest_imu = inputs.imu[-1]
         most = self._config.limits.hold_after
-        if self._felt is None or inputs.time - self._felt.time > most:
+        if self._newest_imu is None or inputs.time - self._newest_imu.time > most:
             return f"it flies by the IMU, and nothing was heard of that for more than {most:g} s"
-        return None if self.safety.armed else unlike_rest(self._felt.sample)
+        return None if self.safety.armed else check_at_rest(self._newest_imu.sample)
 
     def _begin(self) -> None:
         """Reset flyer and progress for a new flight."""
@@ -312,7 +312,7 @@ def describe_inputs(inputs: Inputs) -> dict[str, Any]:
         "overrun": inputs.overrun,
         "voltages": [list(reading) for reading in inputs.voltages],
         "dropped": inputs.dropped,
-        **({"imu": [[felt.time, *felt.sample.tolist()] for felt in inputs.imu]} if inputs.imu else {}),
+        **({"imu": [[reading.time, *reading.sample.tolist()] for reading in inputs.imu]} if inputs.imu else {}),
         **({"refusal": inputs.refusal} if inputs.refusal else {}),
     }
 
@@ -327,9 +327,9 @@ def read_inputs(message: dict[str, Any]) -> Inputs:
     voltages = [Reading(*reading) for reading in message.get("voltages", ())]
     operator, dropped = Operator(*message["operator"]), message.get("dropped", False)
     overrun = int(message["overrun"])  # older recordings hold a bool
-    felt = [ImuReading(arrived, np.array(sample)) for arrived, *sample in message.get("imu", ())]
+    imu = [ImuReading(arrived, np.array(sample)) for arrived, *sample in message.get("imu", ())]
     refusal = message.get("refusal", "")
-    return Inputs(message["time"], received, operator, overrun, voltages, dropped, felt, refusal)
+    return Inputs(message["time"], received, operator, overrun, voltages, dropped, imu, refusal)
 
 
 def describe_outputs(outputs: Outputs) -> dict[str, Any]:

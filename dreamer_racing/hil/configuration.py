@@ -22,7 +22,7 @@ from dreamer_racing.hil.flyer import (
     check_ranges,
     check_rate_loop,
 )
-from dreamer_racing.hil.links import HEARING, LINKS, LinkConfig
+from dreamer_racing.hil.links import BATTERY_LINKS, LINKS, LinkConfig
 from dreamer_racing.hil.links.sitl import MSP_PORT
 from dreamer_racing.hil.operator import (
     PORT,
@@ -45,9 +45,9 @@ PILOT_RATE = 50.0  # Hz
 SIMULATED = ("simulated", "betaflight_sitl")  # links to simulated vehicles, which can hurt nobody
 ARMING = tuple(link for link in BETAFLIGHT if link != "msp_override")  # links that arm by a channel
 OPERATORS = ("keyboard", "udp", "timed")
-MADE_RATES = ("PoseStamped", "VISION_POSITION_ESTIMATE", "ATT_POS_MOCAP")  # messages without body rates
+WITHOUT_BODY_RATES = ("PoseStamped", "VISION_POSITION_ESTIMATE", "ATT_POS_MOCAP")  # messages without body rates
 SPARE = 5.0  # s added to the flight of actor=identify for its take-off
-MOST = 1e4  # rad/s: as good as no limit
+UNLIMITED_RATE = 1e4  # rad/s: as good as no limit
 
 
 LimitsConfig = make_dataclass(
@@ -185,7 +185,7 @@ def check_read(config: HilConfig) -> None:
         (("serial_port",), config.link == "betaflight_sitl", "link=betaflight_sitl"),
         (("arm_channel",), config.link in ARMING, f"link={', '.join(ARMING)}"),
         (("mass", "full_thrust", "reference_voltage", "voltage"), throttle, "a link that takes a throttle"),
-        (("voltage_tolerance", "voltage_smoothing"), config.link in HEARING, f"link={', '.join(HEARING)}"),
+        (("voltage_tolerance", "voltage_smoothing"), config.link in BATTERY_LINKS, f"link={', '.join(BATTERY_LINKS)}"),
         (("pose_host", "pose_port"), config.pose_device is None and config.pose != "ros2", "poses over the network"),
         (("pose_device",), config.pose == "mavlink", "pose=mavlink"),
         (("pose_baud",), config.pose_device is not None, "pose_device="),
@@ -295,9 +295,9 @@ def tolerances_of(config: HilConfig) -> dict[str, float]:
 
     Body rates estimated from attitudes only lag behind them, and a hovering vehicle is not stranded.
     """
-    made = config.pose_message in MADE_RATES or (config.pose == "ros2" and config.pose_message is None)
+    estimated = config.pose_message in WITHOUT_BODY_RATES or (config.pose == "ros2" and config.pose_message is None)
     hovers = {"still_time": 3600.0} if config.actor == IDENTIFY else {}
-    return {**({"rate_tolerance": MOST} if made else {}), **hovers}
+    return {**({"rate_tolerance": UNLIMITED_RATE} if estimated else {}), **hovers}
 
 
 def stamping_of(config: HilConfig) -> Stamping:
@@ -335,7 +335,7 @@ def link_config(config: HilConfig, contract: dict[str, Any], rate: float) -> Lin
 
 def battery_config(config: HilConfig) -> BatteryConfig | None:
     """Return the battery's settings; None if the link reports no voltage, or none is given."""
-    if config.link not in HEARING or config.voltage is None:
+    if config.link not in BATTERY_LINKS or config.voltage is None:
         return None
     return BatteryConfig(voltage=config.voltage, tolerance=config.voltage_tolerance, smoothing=config.voltage_smoothing)
 

@@ -52,7 +52,7 @@ class ActorFlyer:
 
     Attributes:
         contract: The actor's contract.
-        feels: Whether it needs IMU samples.
+        needs_imu: Whether it needs IMU samples.
 
     Raises:
         FileNotFoundError: There is no such file.
@@ -65,7 +65,7 @@ class ActorFlyer:
         self.contract: dict[str, Any] = self._actor.contract
         self.camera: Camera | None = camera_of(self.contract)
         self.rate = float(self.contract["control"]["rate_hz"])
-        self.feels = self._actor.feels
+        self.needs_imu = self._actor.needs_imu
 
     def reset(self) -> None:
         """Begin a flight."""
@@ -74,8 +74,8 @@ class ActorFlyer:
     def act(self, pose: Pose, image: np.ndarray | None, target_gate: int, imu: np.ndarray | None = None) -> Setpoint:
         """Return the actor's setpoint for the image and, if it uses the IMU, a sample (6,)."""
         assert image is not None, "there is a camera, so there is an image"
-        felt = None if imu is None else imu.astype(np.float32)
-        thrust, *rates = self._actor.setpoint(self._actor.step(image, imu=felt))
+        sample = None if imu is None else imu.astype(np.float32)
+        thrust, *rates = self._actor.setpoint(self._actor.step(image, imu=sample))
         return Setpoint(float(thrust), np.array(rates))
 
     def prepare(self) -> None:
@@ -225,13 +225,13 @@ def _unlike_loop(trained: dict[str, Any], there: QuadrotorParameters) -> tuple[s
     return None
 
 
-def check_ranges(contract: dict[str, Any], limits: SafetyLimits, meant: Collection[str] = ()) -> list[str]:
+def check_ranges(contract: dict[str, Any], limits: SafetyLimits, user_limits: Collection[str] = ()) -> list[str]:
     """Refuse an actor whose action range exceeds the safety limits, which would clip its actions.
 
     Args:
         contract: The actor's contract.
         limits: Safety limits.
-        meant: Names of limits set by the user; these may clip, which is reported.
+        user_limits: Names of limits set by the user; these may clip, which is reported.
 
     Returns:
         What these limits clip, in words.
@@ -253,7 +253,7 @@ def check_ranges(contract: dict[str, Any], limits: SafetyLimits, meant: Collecti
         if all(want <= limit + 1e-6 for want, limit in zip(wanted, most, strict=True)):
             continue
         words = f"limits.{name}={_listed(most)} clips the actor, which asks for up to {_listed(wanted)} {unit}"
-        if name not in meant:
+        if name not in user_limits:
             raise ValueError(f"{words}. Set limits.{name}={_listed(wanted)}, or a smaller one if that is meant.")
         clipped.append(words)
     return clipped

@@ -66,7 +66,7 @@ def decode_imu(data: bytes) -> np.ndarray | None:
     return make_sample(tuple(numbers[:3]), tuple(numbers[3:]))
 
 
-def unlike_rest(sample: np.ndarray) -> str | None:
+def check_at_rest(sample: np.ndarray) -> str | None:
     """Return why a sample cannot be that of a resting vehicle, in words; None if it can."""
     force = float(np.linalg.norm(sample[3:]))
     if math.isfinite(force) and abs(force - GRAVITY) <= AT_REST * GRAVITY:

@@ -14,7 +14,7 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from dreamer_racing.hil.aside import Aside
+from dreamer_racing.hil.aside import BackgroundWorker
 from dreamer_racing.hil.battery import Reading
 from dreamer_racing.hil.chain import FlightChain, Inputs, Outputs, describe_inputs, describe_outputs
 from dreamer_racing.hil.operator import Operator, OperatorSource
@@ -26,10 +26,10 @@ from dreamer_racing.hil.watchdog import Watchdog
 
 logger = logging.getLogger(__name__)
 
-FAREWELL = 1.0
+DISARM_SECONDS = 1.0
 """s for which disarm frames are sent after the last tick, however the flight ended."""
 
-FAREWELL_RATE = 50.0
+DISARM_RATE = 50.0
 """Hz of those frames [choice]."""
 
 LINES_MOST = 64
@@ -148,7 +148,7 @@ class FlightLoop:
         self._recorder, self._watchers = recorder, watchers
         self._clock = clock or MonotonicClock()
         self._watchdog = Watchdog(link, chain.safety.limits.tick_max, self._clock.now)
-        self._lines = Aside(LINES_MOST)
+        self._lines = BackgroundWorker(LINES_MOST)
         self._stop: str | None = None
         self._dropped = False  # whether the command of the tick before was dropped
         self._broken: set[str] = set()  # what has failed: link, source of poses, operator's switch
@@ -173,7 +173,7 @@ class FlightLoop:
                 self._chain.warm_up()
                 return self._run(duration, patience)
             finally:
-                self._say_farewell()
+                self._send_disarm_frames()
                 self._watchdog.close()
                 self._lines.close(LINES_PATIENCE)
 
@@ -220,18 +220,18 @@ class FlightLoop:
 
     def _log(self, level: int, message: str, *values: object, error: Exception | None = None) -> None:
         """Log a line without waiting for the terminal."""
-        self._lines.do(lambda: logger.log(level, message, *values, exc_info=error))
+        self._lines.submit(lambda: logger.log(level, message, *values, exc_info=error))
 
     def _tick(self, start: float, deadline: float, overrun: int, armed: bool) -> Outputs:
         """Run one tick: inputs → chain → link → recording."""
         operator = self._ask_operator(armed)
         heard = self._listen()
-        felt = self._link.feel() if self._chain.feels else []
+        imu = self._link.read_imu() if self._chain.needs_imu else []
         refusal = self._link.refusal
-        inputs = Inputs(start, self._take_poses(), operator, overrun, heard or [], self._dropped, felt, refusal)
+        inputs = Inputs(start, self._take_poses(), operator, overrun, heard or [], self._dropped, imu, refusal)
         outputs = self._chain.tick(inputs)
         if outputs.voltage is not None:
-            self._link.reckon_with(outputs.voltage)
+            self._link.set_voltage(outputs.voltage)
         sent = self._send(outputs.verdict.command)
         self._dropped = not sent or heard is None
         done = self._clock.now()
@@ -319,17 +319,17 @@ class FlightLoop:
         if inputs.received:
             noted.latency.append(done - inputs.received[-1].time)
 
-    def _say_farewell(self) -> None:
+    def _send_disarm_frames(self) -> None:
         """Send disarm frames for a while: the vehicle must hear one, and radios lose some."""
         deadline, failed = self._clock.now(), False
-        for _ in range(round(FAREWELL * FAREWELL_RATE)):
+        for _ in range(round(DISARM_SECONDS * DISARM_RATE)):
             try:
                 self._watchdog.send(at_rest())
             except Exception as error:  # whatever failed, the next frame may get through
                 if not failed:
                     self._log(logging.ERROR, "the link does not take the disarm frame: %s", error)
                 failed = True
-            deadline += 1.0 / FAREWELL_RATE
+            deadline += 1.0 / DISARM_RATE
             self._clock.sleep_until(deadline)
 
     @contextmanager

@@ -11,7 +11,7 @@ from dreamer_racing.hil.safety_limits import SafetyLimits, Vector, to_number, to
 from dreamer_racing.hil.vehicle import Pose
 
 
-class Seen(NamedTuple):
+class PlainPose(NamedTuple):
     """A `Pose` in plain Python numbers, with an attitude of unit length."""
 
     time: float
@@ -37,13 +37,13 @@ class Seen(NamedTuple):
         w, x, y, z = self.attitude
         return math.degrees(math.atan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z)))
 
-    def degrees_from(self, other: Seen) -> float:
+    def degrees_from(self, other: PlainPose) -> float:
         """Return the angle between this attitude and another, about any axis, the short way round."""
         cosine = sum(here * there for here, there in zip(self.attitude, other.attitude, strict=True))
         return math.degrees(2.0 * math.acos(min(1.0, abs(cosine))))
 
 
-def read_pose(pose: Pose) -> Seen | None:
+def read_pose(pose: Pose) -> PlainPose | None:
     """Return a pose in plain numbers; None if one is not finite, or the attitude is far from unit length."""
     time = to_number(pose.time)
     position, velocity, rates = (
@@ -55,7 +55,7 @@ def read_pose(pose: Pose) -> Seen | None:
     length = math.hypot(*attitude)
     if not 0.9 < length < 1.1:
         return None
-    return Seen(time, position, tuple(value / length for value in attitude), velocity, rates)
+    return PlainPose(time, position, tuple(value / length for value in attitude), velocity, rates)
 
 
 class Motion:
@@ -71,38 +71,38 @@ class Motion:
     """
 
     def __init__(self, limits: SafetyLimits) -> None:
-        self.newest: Seen | None = None
+        self.newest: PlainPose | None = None
         self.repeats = False
         self.changed_at = -math.inf
         self._limits = limits
         self._odometer = Odometer(limits.velocity_window, gap=limits.cut_after)
         self._turns = TurnOdometer(limits.velocity_window, gap=limits.hold_after)
 
-    def take(self, seen: Seen) -> Findings:
+    def check_pose(self, pose: PlainPose) -> Findings:
         """Add a pose that is newer than the last; return findings of motion that is impossible for a vehicle."""
-        last, self.newest = self.newest, seen
-        self.repeats = last is not None and (seen.position, seen.attitude) == (last.position, last.attitude)
+        last, self.newest = self.newest, pose
+        self.repeats = last is not None and (pose.position, pose.attitude) == (last.position, last.attitude)
         if not self.repeats:
-            self.changed_at = seen.time
-        findings = {} if last is None else self._check_step(last, seen)
-        return findings | self._check_claims(seen)
+            self.changed_at = pose.time
+        findings = {} if last is None else self._check_step(last, pose)
+        return findings | self._check_claims(pose)
 
-    def _check_claims(self, seen: Seen) -> Findings:
+    def _check_claims(self, pose: PlainPose) -> Findings:
         """Compare reported velocities and body rates, by which poses are extrapolated, with how the poses changed."""
         limits = self._limits
-        moved = self._odometer.mismatch(seen.time, seen.position, seen.velocity)
-        turned = self._turns.mismatch(seen.time, seen.attitude, seen.body_rates)
+        moved = self._odometer.mismatch(pose.time, pose.position, pose.velocity)
+        turned = self._turns.mismatch(pose.time, pose.attitude, pose.body_rates)
         words = [
             *_differ("velocities and positions", "m/s", moved, limits.velocity_tolerance),
             *_differ("body rates and attitudes", "rad/s", turned, limits.rate_tolerance),
         ]
         return {Reason.POSE_CONTRADICTION: ", and ".join(words)} if words else {}
 
-    def _check_step(self, last: Seen, seen: Seen) -> Findings:
+    def _check_step(self, last: PlainPose, pose: PlainPose) -> Findings:
         """Compare distance and angle between two poses with what is possible in the time between them."""
-        limits, elapsed = self._limits, seen.time - last.time
+        limits, elapsed = self._limits, pose.time - last.time
         findings: Findings = {}
-        moved, turned = math.dist(seen.position, last.position), seen.degrees_from(last)
+        moved, turned = math.dist(pose.position, last.position), pose.degrees_from(last)
         allowed = limits.reach(elapsed)
         if not moved <= allowed:
             findings[Reason.POSE_JUMP] = f"the pose jumped by {moved:.3g} m (allowed since the last: {allowed:.3g})"

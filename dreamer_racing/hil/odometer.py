@@ -17,7 +17,7 @@ class _Mark(NamedTuple):
     time: float
     place: Vector
     rate: Vector
-    led: Vector
+    integral: Vector
 
 
 class Odometer:
@@ -56,22 +56,23 @@ class Odometer:
         last = marks[-1] if marks else None
         if last is None or time - last.time > self._gap:
             marks.clear()
-            led = self._start
+            integral = self._start
         else:
             half = 0.5 * (time - last.time)
-            led = self._lead(last.led, tuple(half * (old + new) for old, new in zip(last.rate, rate, strict=True)))
-        marks.append(_Mark(time, place, rate, led))
+            step = tuple(half * (old + new) for old, new in zip(last.rate, rate, strict=True))
+            integral = self._integrate(last.integral, step)
+        marks.append(_Mark(time, place, rate, integral))
         while len(marks) > 2 and time - marks[1].time >= self._window:
             marks.popleft()
         first, elapsed = marks[0], time - marks[0].time
         if elapsed < self._window or elapsed <= 0.0:
             return None
-        return self._apart(self._change(first.place, place), self._change(first.led, led)) / elapsed
+        return self._distance(self._change(first.place, place), self._change(first.integral, integral)) / elapsed
 
     @staticmethod
-    def _lead(led: Vector, step: Vector) -> Vector:
+    def _integrate(integral: Vector, step: Vector) -> Vector:
         """Return the integral after one more step."""
-        return tuple(here + more for here, more in zip(led, step, strict=True))
+        return tuple(here + more for here, more in zip(integral, step, strict=True))
 
     @staticmethod
     def _change(first: Vector, last: Vector) -> Vector:
@@ -79,9 +80,9 @@ class Odometer:
         return tuple(there - here for here, there in zip(first, last, strict=True))
 
     @staticmethod
-    def _apart(went: Vector, meant: Vector) -> float:
+    def _distance(travelled: Vector, integrated: Vector) -> float:
         """Return the distance between two displacements."""
-        return math.dist(went, meant)
+        return math.dist(travelled, integrated)
 
 
 class TurnOdometer(Odometer):
@@ -101,12 +102,12 @@ class TurnOdometer(Odometer):
     _start: ClassVar[Vector] = (1.0, 0.0, 0.0, 0.0)
 
     @staticmethod
-    def _lead(led: Vector, step: Vector) -> Vector:
+    def _integrate(integral: Vector, step: Vector) -> Vector:
         angle = math.hypot(*step)
         if not math.isfinite(angle):
             return 4 * (math.nan,)
         scale = math.sin(0.5 * angle) / angle if angle else 0.0
-        return attitude.product(led, (math.cos(0.5 * angle), *(scale * part for part in step)))
+        return attitude.product(integral, (math.cos(0.5 * angle), *(scale * part for part in step)))
 
     @staticmethod
     def _change(first: Vector, last: Vector) -> Vector:
@@ -114,6 +115,6 @@ class TurnOdometer(Odometer):
         return turned if turned[0] >= 0.0 else tuple(-part for part in turned)  # both are the same rotation
 
     @staticmethod
-    def _apart(went: Vector, meant: Vector) -> float:
-        distance = math.dist(went, meant)
+    def _distance(travelled: Vector, integrated: Vector) -> float:
+        distance = math.dist(travelled, integrated)
         return 4.0 * math.asin(min(1.0, 0.5 * distance)) if math.isfinite(distance) else math.inf

@@ -174,7 +174,7 @@ def is_remote_terminal() -> bool:
     return bool(os.environ.get("SSH_CONNECTION"))
 
 
-def send_will(source: OperatorSource, send: Callable[[bytes], object], sleep: Callable[[float], None]) -> None:
+def send_operator(source: OperatorSource, send: Callable[[bytes], object], sleep: Callable[[float], None]) -> None:
     """Send an operator's wish until it is a kill, then the kill for a while; Ctrl-C is a kill, too.
 
     Args:
@@ -182,14 +182,14 @@ def send_will(source: OperatorSource, send: Callable[[bytes], object], sleep: Ca
         send: Sends a packet. Packets are numbered by the clock, so that a restarted switch continues the sequence.
         sleep: Waits for a number of s.
     """
-    number, left, will, said = int(SEND_RATE * time.time()), KILLS, Operator(False, False), ""
+    number, left, wish, said = int(SEND_RATE * time.time()), KILLS, Operator(False, False), ""
     while left:
         try:
-            will = will if will.kill else source.poll()
-            word = "kill" if will.kill else "the enable is given" if will.enable else "no enable"
+            wish = wish if wish.kill else source.poll()
+            word = "kill" if wish.kill else "the enable is given" if wish.enable else "no enable"
             try:
-                send(encode_operator(number, will))
-                left -= will.kill
+                send(encode_operator(number, wish))
+                left -= wish.kill
             except OSError as error:  # the network may come back; the enable lapses meanwhile, and a kill is kept
                 word = f"{word}, which is not sent: {error}"
             if word != said:
@@ -198,7 +198,7 @@ def send_will(source: OperatorSource, send: Callable[[bytes], object], sleep: Ca
             number += 1
             sleep(1.0 / SEND_RATE)
         except KeyboardInterrupt:
-            will = Operator(False, True)
+            wish = Operator(False, True)
 
 
 def main() -> None:
@@ -217,7 +217,7 @@ def main() -> None:
         parser.exit(2, f"{arguments.host}: {error}\n")
     logger.info("e: the enable, and again to take it back; any other key: kill. To %s:%d", *address)
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as switch, contextlib.closing(keyboard):
-        send_will(keyboard, lambda data: switch.sendto(data, address), time.sleep)
+        send_operator(keyboard, lambda data: switch.sendto(data, address), time.sleep)
 
 
 class TimedOperator:

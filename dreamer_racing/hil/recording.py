@@ -20,7 +20,7 @@ import numpy as np
 
 from dreamer_racing.commands import install_extra
 from dreamer_racing.envs.tracks import Track, load_track, read_track
-from dreamer_racing.hil.aside import Aside
+from dreamer_racing.hil.aside import BackgroundWorker
 
 FLIGHT, TICK = "/flight", "/tick"
 FILE = "flight.mcap"
@@ -59,7 +59,7 @@ class FlightRecorder:
             for topic in (FLIGHT, TICK)
         }
         self._sequence = 0
-        self._path, self._aside, self._failed = path, Aside(WAITING_MOST), False
+        self._path, self._worker, self._failed = path, BackgroundWorker(WAITING_MOST), False
         self._write(FLIGHT, 0.0, _encode({"format_version": FORMAT_VERSION, **about}))
 
     def tick(self, time: float, message: dict[str, Any]) -> None:
@@ -69,7 +69,7 @@ class FlightRecorder:
             OSError: An earlier tick could not be written, or the disk has stalled for long; the file ends there.
         """
         data = _encode(message)  # now, because its objects may change
-        if not self._aside.do(partial(self._write, TICK, time, data)):
+        if not self._worker.submit(partial(self._write, TICK, time, data)):
             self._fail()
 
     def _write(self, topic: str, time: float, data: bytes) -> None:
@@ -80,7 +80,7 @@ class FlightRecorder:
 
     def _fail(self) -> None:
         self._failed = True
-        raise self._aside.error or OSError(f"{self._path}: the disk does not take what is to be written.")
+        raise self._worker.error or OSError(f"{self._path}: the disk does not take what is to be written.")
 
     def close(self) -> None:
         """Finish the file; may be called twice.
@@ -90,11 +90,11 @@ class FlightRecorder:
         """
         if self._file.closed:
             return
-        written, said = self._aside.close(CLOSING), self._failed
+        written, said = self._worker.close(CLOSING), self._failed
         if written and not said:
             self._writer.finish()
             self._file.close()
-        elif written or self._aside.error is not None:  # else the disk hangs, and closing would, too
+        elif written or self._worker.error is not None:  # else the disk hangs, and closing would, too
             with suppress(OSError):  # raised before, or below
                 self._file.close()
         if not written and not said:

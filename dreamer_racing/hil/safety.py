@@ -169,7 +169,7 @@ class Safety:
         return self._armed_at + self.limits.arm_time
 
     @property
-    def lets_through(self) -> bool:
+    def sends_setpoint(self) -> bool:
         """Whether the last tick sent the wanted setpoint: neither arming nor holding."""
         return self.state is State.FLYING and not self._arming
 
@@ -294,7 +294,7 @@ class Safety:
             return {}
         age = to_number(tick.pose_age)
         self._measured_at = min(seen.time, self._now - age) if math.isfinite(age) else -math.inf
-        return self._motion.take(seen)
+        return self._motion.check_pose(seen)
 
     def _check_flight(self) -> Findings:
         limits, seen = self.limits, self._motion.newest

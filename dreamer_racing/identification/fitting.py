@@ -20,7 +20,7 @@ from torch import Tensor
 
 from dreamer_racing.envs.drone.parameters import QuadrotorParameters
 from dreamer_racing.envs.drone.quadrotor import Quadrotor
-from dreamer_racing.envs.drone.rate_loop import Own, Row
+from dreamer_racing.envs.drone.rate_loop import DroneParameter, Row
 from dreamer_racing.envs.simulator.fused_flight import FusedFlight
 from dreamer_racing.identification.recorded import AXES, DT, Recorded, stretches
 
@@ -38,13 +38,13 @@ FLOOR = 0.003
 """Least assumed error, as a share of the RMS of rates [choice]."""
 OUTLIER = 3.0
 """Standard deviations beyond which an error counts linearly, not squared: recordings have pauses and gusts."""
-LEFT_OUT = 0.1
+TRIMMED_SHARE = 0.1
 """Share of the largest errors, due to pauses and gusts, that `Fit.errors` leaves out."""
 STEPS = 15
 """Largest number of Gauss-Newton steps."""
-UNKNOWN = 0.5
+UNKNOWN_SHARE = 0.5
 """Share of the prior's standard deviation above which a fitted parameter counts as unknown [choice]."""
-DONE = 0.02
+CONVERGED = 0.02
 """Largest change of a parameter, as a share of its prior's standard deviation, at which the fit ends."""
 
 
@@ -84,7 +84,8 @@ class Fit:
         values: By name: fitted value, relative to the initial one; for the delay, its change in s.
         deviations: By name: its standard deviation, as a share, or in s for the delay; from differences of stretches.
         unknown: Names of parameters that the recording hardly determines: they stay near their initial values.
-        errors: By axis: RMS error of body rates relative to the RMS of commanded ones, without the largest `LEFT_OUT`.
+        errors: By axis: RMS error of body rates, without the largest `TRIMMED_SHARE`, relative to the RMS of commanded
+            ones.
         before: As ``errors``, of the initial parameters.
         thrust: Measured collective thrust, relative to the model's; None if no force was measured.
     """
@@ -98,7 +99,7 @@ class Fit:
     thrust: float | None
 
 
-class Flown(NamedTuple):
+class Simulated(NamedTuple):
     """Stretches as simulated with candidates.
 
     Args:
@@ -153,11 +154,11 @@ class Model:
         gyroscopic = torch.linalg.cross(rates, self._inertia * rates)
         rates += DT / self._inertia * (self._force[:, 3:] - gyroscopic)
 
-    def fly(self, candidates: Tensor) -> Flown:
+    def fly(self, candidates: Tensor) -> Simulated:
         """Simulate all stretches with candidates (C, P), from the measured rates at their starts on."""
         quadrotor, loop, (_, stretches_) = self._quadrotor, self._quadrotor.rate_loop, self._shape
         assert loop is not None
-        late = self._give(candidates)  # (C,) ms
+        late = self._set_parameters(candidates)  # (C,) ms
         quadrotor.reset(torch.ones(len(self._qpos), dtype=torch.bool))
         self._begin(len(candidates))
         rates, force = [], []
@@ -168,13 +169,13 @@ class Model:
             arrived = self._fresh[at, columns].flatten() & (step >= late).repeat_interleave(stretches_)
             loop.state[:, Row.THROTTLE, 2].masked_fill_(arrived, 0.0)
             if step == self._handover:
-                self._remember(candidate=0)
+                self._store_states(candidate=0)
             self._flight.step(0)
             if step % EVERY == EVERY - 1:
                 rates.append(self._qvel[:, 3:].view(*self._shape, 3).clone())
                 force.append(quadrotor.rotor_speed.square().sum(1).view(self._shape) / self._drone.mass)
         self._remembered = self._next
-        return Flown(torch.stack(rates), torch.stack(force))
+        return Simulated(torch.stack(rates), torch.stack(force))
 
     def _begin(self, candidates: int) -> None:
         """Put the drones at the starts of their stretches."""
@@ -192,24 +193,25 @@ class Model:
                 rows = self._follows.repeat(candidates).view(-1, *[1] * (kept.ndim - 1))
                 kept.copy_(torch.where(rows, of_all, kept))
 
-    def _remember(self, candidate: int) -> None:
+    def _store_states(self, candidate: int) -> None:
         """Store controller state and rotor speeds of a candidate's drones, each for the stretch after its own."""
         loop = self._quadrotor.rate_loop
         assert loop is not None
         own = slice(candidate * self._shape[1], (candidate + 1) * self._shape[1])
         self._next = loop.state[own].roll(1, 0).clone(), self._quadrotor.rotor_speed[own].roll(1, 0).clone()
 
-    def _give(self, candidates: Tensor) -> Tensor:
+    def _set_parameters(self, candidates: Tensor) -> Tensor:
         """Set the parameters of the drones of candidates (C, P); return the delay of each, (C,) ms."""
         loop, values = self._quadrotor.rate_loop, by_name(candidates)
         assert loop is not None
-        own = torch.ones(len(candidates), len(Own), 3, dtype=torch.float64)
-        for row, gain, axes in ((Own.P, "p", 3), (Own.I, "i", 3), (Own.D, "d", 2)):
+        own = torch.ones(len(candidates), len(DroneParameter), 3, dtype=torch.float64)
+        for row, gain, axes in ((DroneParameter.P, "p", 3), (DroneParameter.I, "i", 3), (DroneParameter.D, "d", 2)):
             for index, axis in enumerate(AXES[:axes]):
                 own[:, row, index] = values[f"{gain}_{axis}"].exp()
         decay = math.log(self._quadrotor.motor_decay) / values["motor_lag"].exp()
-        own[:, Own.MOTORS, 0], own[:, Own.MOTORS, 1], own[:, Own.MOTORS, 2] = decay.exp(), (0.5 * decay).exp(), 0.0
-        loop.own.copy_(own.repeat_interleave(self._shape[1], 0))
+        motors = torch.stack((decay.exp(), (0.5 * decay).exp(), torch.zeros_like(decay)), dim=1)
+        own[:, DroneParameter.MOTORS] = motors
+        loop.drone_parameters.copy_(own.repeat_interleave(self._shape[1], 0))
         return ((self._delay + values["delay"]) / DT).round().long().clamp(min=0)
 
 
@@ -243,15 +245,15 @@ def fit(recorded: Recorded, nominal: QuadrotorParameters) -> Fit:
     floor = FLOOR * measured.square().mean((0, 1)).sqrt().clamp(min=0.1)
     found, before, last = torch.zeros(len(PARAMETERS), dtype=torch.float64), None, None
     for number in range(STEPS):
-        flown = model.fly(found + torch.cat((torch.zeros(1, len(priors)), probes.diag())))
-        error = (flown.rates - measured.unsqueeze(1))[kept]  # (T, C, S, 3)
+        simulated = model.fly(found + torch.cat((torch.zeros(1, len(priors)), probes.diag())))
+        error = (simulated.rates - measured.unsqueeze(1))[kept]  # (T, C, S, 3)
         rms = _rms(error[:, 0], recorded, parts)
         words = ", ".join(f"{axis} {each:.1%}" for axis, each in rms.items())
         logger.info("identification: step %d, errors %s", number, words)
         before = before or rms
-        change, known, differing = _solve(error, floor, probes, priors, found)
-        last = Step(found.clone(), rms, known, differing, flown)
-        if (change / priors).abs().max() < DONE:
+        change, posterior_deviation, sandwich_deviation = _solve(error, floor, probes, priors, found)
+        last = Step(found.clone(), rms, posterior_deviation, sandwich_deviation, simulated)
+        if (change / priors).abs().max() < CONVERGED:
             break
         found = found + change
         found[-1] = found[-1].clamp(min=-nominal.command_delay)
@@ -266,16 +268,16 @@ class Step(NamedTuple):
     Args:
         found: (P,) parameters.
         errors: Their errors, by axis.
-        known: (P,) their posterior standard deviations.
-        differing: (P,) likewise, from differences of stretches.
-        flown: Simulated with them, and with each one probed.
+        posterior_deviation: (P,) their posterior standard deviations.
+        sandwich_deviation: (P,) likewise, from differences of stretches.
+        simulated: Simulated with them, and with each one probed.
     """
 
     found: Tensor
     errors: dict[str, float]
-    known: Tensor
-    differing: Tensor
-    flown: Flown
+    posterior_deviation: Tensor
+    sandwich_deviation: Tensor
+    simulated: Simulated
 
 
 def _solve(
@@ -304,15 +306,15 @@ def _solve(
     scores = torch.einsum("tsap,tsa->sp", weighted, present)  # (S, P)
     covariance = torch.linalg.inv(information)
     change = -(covariance @ (scores.sum(0) + found / priors.square()))
-    differing = covariance @ (scores - scores.mean(0)).T  # (P, S)
-    return change.clamp(-priors, priors), covariance.diagonal().sqrt(), differing.square().sum(1).sqrt()
+    sandwich_deviation = covariance @ (scores - scores.mean(0)).T  # (P, S)
+    return change.clamp(-priors, priors), covariance.diagonal().sqrt(), sandwich_deviation.square().sum(1).sqrt()
 
 
 def _rms(error: Tensor, recorded: Recorded, parts: Sequence[slice]) -> dict[str, float]:
     """Return the RMS of errors (T, S, 3), without the largest, relative to that of the commanded rates, by axis."""
     asked = np.concatenate([recorded.command[part, 1:] for part in parts])
     squares = error.square().flatten(0, 1).sort(0).values  # (T · S, 3)
-    kept = squares[: math.ceil((1.0 - LEFT_OUT) * len(squares))].mean(0).sqrt()
+    kept = squares[: math.ceil((1.0 - TRIMMED_SHARE) * len(squares))].mean(0).sqrt()
     relative = kept / torch.from_numpy(asked).square().mean(0).sqrt().clamp(min=1e-6)
     return dict(zip(AXES, relative.tolist(), strict=False))
 
@@ -323,14 +325,14 @@ def _conclude(
     """Return the result of a fit from its last step."""
     unknown = tuple(
         parameter.name
-        for parameter, each in zip(PARAMETERS, last.known.tolist(), strict=True)
-        if each > UNKNOWN * parameter.prior
+        for parameter, each in zip(PARAMETERS, last.posterior_deviation.tolist(), strict=True)
+        if each > UNKNOWN_SHARE * parameter.prior
     )
     found = {parameter.name: float(each) for parameter, each in zip(PARAMETERS, last.found, strict=True)}
     values = {name: each if name == "delay" else math.exp(each) for name, each in found.items()}
-    thrust = _thrust(last.flown.force[:, 0], recorded, parts)
+    thrust = _thrust(last.simulated.force[:, 0], recorded, parts)
     parameters = apply(nominal, values, thrust or 1.0)
-    deviations = dict(zip(found, last.differing.tolist(), strict=True))
+    deviations = dict(zip(found, last.sandwich_deviation.tolist(), strict=True))
     return Fit(parameters, values, deviations, unknown, last.errors, before, thrust)
 
 

@@ -30,10 +30,10 @@ FASTEST = 500.0
 LONGEST_GAP = 0.05
 """s without a measurement over which nothing is interpolated [choice]."""
 
-QUIET = (0.4, 0.4, 0.3, 0.8)
+MIN_EXCITATION = (0.4, 0.4, 0.3, 0.8)
 """Least standard deviation of each axis's commands within a window for it to count as moved, in `UNITS` [choice]:
 below, noise and model errors are as large as the response."""
-LEAST = (2.0, 2.0, 3.0, 2.0)
+MIN_SECONDS = (2.0, 2.0, 3.0, 2.0)
 """s for which each axis must be moved [choice]: yaw, which is slow, for longer."""
 WINDOW = 1.0
 """s over which variation is measured [choice]."""
@@ -55,7 +55,7 @@ class Recorded:
     rates: np.ndarray
     force: np.ndarray
 
-    def moved(self) -> tuple[float, ...]:
+    def excited_seconds(self) -> tuple[float, ...]:
         """Return for how long each axis was moved while it was measured, s: roll, pitch, yaw, thrust."""
         asked = np.column_stack((self.command[:, 1:], self.command[:, 0]))
         seen = np.isfinite(self.rates).all(1)
@@ -64,7 +64,7 @@ class Recorded:
         deviation = np.array([asked[part].std(0) if seen[part].mean() > 0.9 else np.zeros(4) for part in windows])
         if not len(deviation):
             return 0.0, 0.0, 0.0, 0.0
-        return tuple(float(WINDOW * count) for count in (deviation > QUIET).sum(0))
+        return tuple(float(WINDOW * count) for count in (deviation > MIN_EXCITATION).sum(0))
 
     def check(self, source: str | Path) -> None:
         """Refuse a recording that is too short or too quiet for a fit.
@@ -73,11 +73,12 @@ class Recorded:
             ValueError: The message says which axis needs what.
         """
         asked, lacking = np.column_stack((self.command[:, 1:], self.command[:, 0])), []
-        for index, (axis, seconds) in enumerate(zip(AXES, self.moved(), strict=True)):
-            if seconds < LEAST[index]:
+        for index, (axis, seconds) in enumerate(zip(AXES, self.excited_seconds(), strict=True)):
+            if seconds < MIN_SECONDS[index]:
                 lacking.append(
-                    f"{axis} was moved for {seconds:g} s, and needs {LEAST[index]:g} s in which its commands vary by "
-                    f"{QUIET[index]:g} {UNITS[index]} or more (over all of it: {asked[:, index].std():.2g})"
+                    f"{axis} was moved for {seconds:g} s, and needs {MIN_SECONDS[index]:g} s in which its commands "
+                    f"vary by {MIN_EXCITATION[index]:g} {UNITS[index]} or more "
+                    f"(over all of it: {asked[:, index].std():.2g})"
                 )
         if lacking:
             raise ValueError(

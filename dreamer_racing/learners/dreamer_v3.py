@@ -89,7 +89,7 @@ class DreamerV3(WorldModelLearner):
             losses |= self.drift_losses(latents, batch)
             if numbers.open_loop_steps:
                 losses["loss_open_loop"] = open_loop_loss(model, latents, batch, numbers.open_loop_steps)
-        self.note_latents(latents)
+        self.store_latents(latents)
 
         with timed("imagine"):
             # Imagination: starting from latents of the records, the policy acts H times in the world model.
@@ -113,7 +113,7 @@ class DreamerV3(WorldModelLearner):
             # A step's weight is the discounted probability of reaching it: 0 if the start had ended its episode.
             start = 1.0 - starts.terminated.to(discount.dtype).unsqueeze(0)
             weight = torch.cat((start, discount[:-1].detach())).cumprod(0)
-            self.return_range.update(parallel.gathered(returns.detach(), dim=1))
+            self.return_range.update(parallel.all_gather(returns.detach(), dim=1))
             scale = self.return_range.scale()
 
             # Actor: the objective on the imagined steps, with detached features (Eq. 11).

@@ -148,7 +148,7 @@ class LatentPPO(WorldModelLearner):
         with timed("world_model"):
             losses, latents = self.world_model_loss(batch)
             losses |= self.drift_losses(latents, batch)
-        self.note_latents(latents)
+        self.store_latents(latents)
         # Agent's critic: its regression on replayed λ-returns also trains the latents to tell what returns depend on.
         with timed("imagine"):
             features = latents.features if numbers.replay_value_gradient else latents.features.detach()
@@ -358,7 +358,7 @@ class PPOUpdate:
         """Make one gradient step if ``active`` (a bool scalar) and if the gradient is finite."""
         self.optimizer.zero_grad(set_to_none=True)
         loss.backward()
-        if parallel.count() > 1:
+        if parallel.num_processes() > 1:
             parallel.average_gradients(self.network.parameters())
         norm = nn.utils.clip_grad_norm_(self.network.parameters(), self.config.gradient_clip)
         good = norm.isfinite() & active

@@ -48,16 +48,16 @@ def check_saved(saved: dict[str, Any], algorithm: str, agent: Agent, own_network
     _check_parts(parts, saved, agent)
 
 
-class Unmatched(NamedTuple):
+class UnmatchedWeights(NamedTuple):
     """Names of networks outside the agent that only one of two learners has."""
 
-    anew: list[str]
+    initial: list[str]
     """Networks of the loading learner only; they keep their initial weights."""
-    left: list[str]
+    unused: list[str]
     """Networks of the saved learner only; they are not loaded."""
 
 
-def check_weights(saved: dict[str, Any], agent: Agent, own_networks: Mapping[str, nn.Module]) -> Unmatched:
+def check_weights(saved: dict[str, Any], agent: Agent, own_networks: Mapping[str, nn.Module]) -> UnmatchedWeights:
     """Check that the weights of a saved learner can be loaded, whatever its algorithm.
 
     Args:
@@ -81,7 +81,7 @@ def check_weights(saved: dict[str, Any], agent: Agent, own_networks: Mapping[str
         wanted = {key: value for key, value in state.items() if _name(name, key) in theirs}
         parts[name] = wanted, {key: there[name][key] for key in wanted if key in there[name]}
     _check_parts(parts, saved, agent)
-    return Unmatched(sorted(ours - theirs), sorted(theirs - ours))
+    return UnmatchedWeights(sorted(ours - theirs), sorted(theirs - ours))
 
 
 def check_format(saved: dict[str, Any]) -> None:

@@ -20,10 +20,10 @@ from dreamer_racing import parallel
 from dreamer_racing.learners.config import LearnerConfig
 from dreamer_racing.learners.gradient_step import FiniteGuard, GraphedStep, gradient_norms, make_optimizer, restore
 from dreamer_racing.learners.learner import Timer, ValueFunction, seeded, untimed
-from dreamer_racing.learners.saved import Unmatched, check_saved, check_weights, load_parameters, own_state
+from dreamer_racing.learners.saved import UnmatchedWeights, check_saved, check_weights, load_parameters, own_state
 from dreamer_racing.losses import Latents, LossConfig, WorldModelLoss, find_targets, policy_drift
 from dreamer_racing.modules import Agent, DreamerPolicy, Interface, ModelSize, get_size
-from dreamer_racing.modules.few_kernels import cast_once, save_kernels
+from dreamer_racing.modules.few_kernels import cast_once, use_few_kernels
 from dreamer_racing.modules.layers import autocast
 from dreamer_racing.modules.rssm import CONTEXT, LatentFormat, join_features
 from dreamer_racing.settings import check_settings
@@ -75,7 +75,7 @@ class WorldModelLearner(ABC):
         few = self.device.type == "cuda" if self.config.few_kernels is None else self.config.few_kernels
         self._casts_once = few and bool(self.config.mixed_precision)
         if few:
-            save_kernels(nn.ModuleList([agent, *self.own_networks.values()]))
+            use_few_kernels(nn.ModuleList([agent, *self.own_networks.values()]))
         self.averaged = None if self.config.average_rate is None else copy.deepcopy(agent).requires_grad_(False)
         self.latents: TensorDictBase | None = None
         self.horizon = self.config.imagination_horizon
@@ -172,7 +172,7 @@ class WorldModelLearner(ABC):
         return self.agent.world_model.rssm.latent_format
 
     @property
-    def flying_agent(self) -> Agent:
+    def evaluation_agent(self) -> Agent:
         """Agent that is evaluated and exported: the averaged one if it is kept, else the trained one."""
         return self.agent if self.averaged is None else self.averaged
 
@@ -181,8 +181,8 @@ class WorldModelLearner(ABC):
         return DreamerPolicy(self.agent.world_model, self.agent.actor, deterministic)
 
     def evaluation_policy(self) -> DreamerPolicy:
-        """Return the policy of `flying_agent`, which shares its parameters."""
-        return DreamerPolicy(self.flying_agent.world_model, self.flying_agent.actor)
+        """Return the policy of `evaluation_agent`, which shares its parameters."""
+        return DreamerPolicy(self.evaluation_agent.world_model, self.evaluation_agent.actor)
 
     def value_function(self) -> ValueFunction:
         """Return the value function of the critic that the actor learns from."""
@@ -192,7 +192,7 @@ class WorldModelLearner(ABC):
     def _value_of_latents(self, acted: TensorDictBase) -> Tensor:
         """Return the critic's values ``(N, 1)`` at the latents that `DreamerPolicy` wrote under "next"."""
         after = acted["next"].select("belief", "state").to(self.device)
-        return self.flying_agent.critic.value(join_features(after["belief"], after["state"]))
+        return self.evaluation_agent.critic.value(join_features(after["belief"], after["state"]))
 
     def open_loop(self, batch: TensorDictBase, num_observed: int) -> tuple[Tensor, Tensor]:
         """Observe the first ``num_observed`` records of a batch ``[B, T]``, then predict the others from their actions.
@@ -217,11 +217,11 @@ class WorldModelLearner(ABC):
                 f"drift_scale={scale:g} holds the policy at the latents that records keep, and the batch has no "
                 f"{CONTEXT!r}: replay with them (replay.context=true), or set drift_scale=0."
             )
-        before, after, same = self.then_and_now(latents, batch)
+        before, after, same = self.stored_and_current_features(latents, batch)
         drift = policy_drift(self.agent.actor, before, after, same.float())
         return {"loss_drift": scale * drift, "policy_drift": drift.detach()}
 
-    def then_and_now(self, latents: Latents, batch: TensorDictBase) -> tuple[Tensor, Tensor, Tensor]:
+    def stored_and_current_features(self, latents: Latents, batch: TensorDictBase) -> tuple[Tensor, Tensor, Tensor]:
         """Return the stored and the current features of the same records.
 
         Args:
@@ -240,7 +240,7 @@ class WorldModelLearner(ABC):
         """Make one gradient step on a batch ``[B, T]``; return its losses and metrics as `update` does."""
         batch = batch.to(self.device, non_blocking=True)
         metrics = self._backward(batch, timed) if self._graph is None else self._graph(batch)
-        if parallel.count() > 1:
+        if parallel.num_processes() > 1:
             metrics = self._of_all_processes(metrics, timed)
         self._guard.check(metrics, batch)
         with timed("optimise"):
@@ -327,7 +327,7 @@ class WorldModelLearner(ABC):
                 number.fill_(value)
         for name, bound in (("min_std", min_std), ("max_std", max_std)):
             if bound is not None:
-                for agent in (self.agent, self.flying_agent):
+                for agent in (self.agent, self.evaluation_agent):
                     agent.actor.get_buffer(name).fill_(bound)
 
     def check_finite(self) -> None:
@@ -371,7 +371,7 @@ class WorldModelLearner(ABC):
         restore(self.optimizer, state_dict["optimizer"])
         self.updates = state_dict["updates"]
 
-    def adopt(self, state_dict: dict[str, Any]) -> Unmatched:
+    def adopt(self, state_dict: dict[str, Any]) -> UnmatchedWeights:
         """Load the weights of another learner's ``state_dict``, whatever its algorithm.
 
         They are the weights that were evaluated: the averaged ones if it kept them. Nothing else is loaded: no
@@ -419,7 +419,7 @@ class WorldModelLearner(ABC):
         """Return the context in which weights are cast to bfloat16 once per update, if so configured."""
         return cast_once(self.modules, torch.bfloat16) if self._casts_once else nullcontext()
 
-    def note_latents(self, latents: Latents) -> None:
+    def store_latents(self, latents: Latents) -> None:
         """Keep the latents of a batch's records, to refresh those in the replay buffer."""
         shape = latents.belief.shape[:2]
         self.latents = TensorDict({"belief": latents.belief.detach(), "state": latents.state.detach()}, shape)

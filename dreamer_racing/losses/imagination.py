@@ -80,7 +80,7 @@ def imagine(rssm: RSSM, actor: Actor, belief: Tensor, state: Tensor, horizon: in
         The rollout.
     """
     if rssm.few_kernels and not torch.is_grad_enabled():
-        return _imagine_low(rssm, actor, belief, state, horizon)
+        return _imagine_few_kernels(rssm, actor, belief, state, horizon)
     features, actions = [join_features(belief, state)], []
     for _ in range(horizon):
         action = actor(features[-1]).sample()
@@ -90,7 +90,7 @@ def imagine(rssm: RSSM, actor: Actor, belief: Tensor, state: Tensor, horizon: in
     return Imagination(torch.stack(features), torch.stack(actions))
 
 
-def _imagine_low(rssm: RSSM, actor: Actor, belief: Tensor, state: Tensor, horizon: int) -> Imagination:
+def _imagine_few_kernels(rssm: RSSM, actor: Actor, belief: Tensor, state: Tensor, horizon: int) -> Imagination:
     """Do the same as ``imagine`` without gradient, with fewer kernels.
 
     Noise is drawn in advance. Features have autocast's type, to which every head would cast them anyway.
@@ -103,6 +103,6 @@ def _imagine_low(rssm: RSSM, actor: Actor, belief: Tensor, state: Tensor, horizo
     draws = zip(noises, rssm.draw_noise(horizon, len(belief)), features[:-1], features[1:], strict=True)
     for of_action, of_state, here, following in draws:
         action = actor(here).sample(of_action)
-        belief = rssm.imagine_low(belief, here, action, of_state, following)
+        belief = rssm.imagine_few_kernels(belief, here, action, of_state, following)
         actions.append(action)
     return Imagination(features, torch.stack(actions))

@@ -193,10 +193,10 @@ def gradient_of_actions(objective: Objective, *others: nn.Module) -> AbstractCon
 
 OBJECTIVES: dict[str, Objective] = {"reinforce": reinforce, "dynamics": dynamics, "clipped": clipped_surrogate}
 """Objectives by their names."""
-OF_COLLECTED = ("clipped",)
+ON_POLICY = ("clipped",)
 """Objectives of collected steps; the others are of imagined steps."""
 
-GONE = {
+REMOVED = {
     "ppo": "PPO learns from what was collected, by the algorithm latent_ppo",
     "flown_ppo": "its critic learns from what was collected, too, by the algorithm latent_ppo",
     "latent_ppo": "it is an algorithm of its own now, recipes/latent_ppo.py loss.critic=latent",
@@ -221,14 +221,14 @@ def find_objective(name: str, collected: bool | None = None) -> Objective:
         if not callable(found):
             raise ValueError(f"Objective {name!r} is no function of a Trajectory.")
         return found
-    if name in GONE:
-        raise ValueError(f"The actor {name!r} is gone: {GONE[name]}.")
+    if name in REMOVED:
+        raise ValueError(f"The actor {name!r} is gone: {REMOVED[name]}.")
     if name not in OBJECTIVES:
         raise ValueError(
             f"Unknown objective {name!r}{suggestion(name, OBJECTIVES)}. Known here: {', '.join(OBJECTIVES)}; one of "
             "your own is given as module:function."
         )
-    if collected is not None and collected is not (name in OF_COLLECTED):
+    if collected is not None and collected is not (name in ON_POLICY):
         steps, takes = ("imagined", "dreamer_v3") if collected else ("collected", "latent_ppo")
         raise ValueError(f"loss.actor={name} learns from {steps} steps: recipes/{takes}.py takes it.")
     return OBJECTIVES[name]

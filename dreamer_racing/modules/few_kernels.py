@@ -24,7 +24,7 @@ LAYERS = (nn.Linear, nn.Conv2d, nn.ConvTranspose2d, BlockLinear, LayerNorm, RMSN
 """Layers whose weights, biases and gains are cast; all other parameters stay in float32."""
 
 
-def save_kernels(module: nn.Module) -> None:
+def use_few_kernels(module: nn.Module) -> None:
     """Turn on ``few_kernels`` in all submodules that have it."""
     for part in module.modules():
         if hasattr(part, "few_kernels"):

@@ -53,7 +53,7 @@ def initialize(weight: Tensor, fan_in: int, scale: float = 1.0) -> None:
     nn.init.trunc_normal_(weight, std=std, a=-2 * std, b=2 * std)
 
 
-class OfSteps:
+class PerStepParameter:
     """Parameter for the steps of one loop, whose gradients are summed once after the loop instead of step by step.
 
     Args:
@@ -128,7 +128,7 @@ class RMSNorm(nn.Module):
     """
 
     shifts = False
-    of_steps: dict[str, OfSteps] | None = None  # see ``unrolled``
+    of_steps: dict[str, PerStepParameter] | None = None  # see ``unrolled``
 
     def __init__(self, features: int) -> None:
         super().__init__()
@@ -146,7 +146,7 @@ class LayerNorm(nn.LayerNorm):
     """Layer normalisation of the 2023 DreamerV3; on CPU one fused kernel, 4-9 times faster than RMS backward."""
 
     shifts = True
-    of_steps: dict[str, OfSteps] | None = None  # see ``unrolled``
+    of_steps: dict[str, PerStepParameter] | None = None  # see ``unrolled``
 
     def __init__(self, features: int) -> None:
         super().__init__(features, eps=NORM_EPS)
@@ -288,7 +288,9 @@ def unrolled(*modules: nn.Module, steps: int | None = None) -> Iterator[None]:
     for layer in layers:
         layer.deferred = layer.defer(with_bias=steps is not None) if layer.weight.requires_grad else None
     for norm in norms:
-        norm.of_steps = {name: OfSteps(gain, steps or 0) for name, gain in norm._parameters.items() if gain is not None}
+        norm.of_steps = {
+            name: PerStepParameter(gain, steps or 0) for name, gain in norm._parameters.items() if gain is not None
+        }
     try:
         yield
     finally:

@@ -21,7 +21,7 @@ from torch.autograd.function import FunctionCtx
 from dreamer_racing.modules.layers import NormedLinear, SplitNormedLinear, autocast_type, linear, unrolled
 from dreamer_racing.modules.recurrent_cells import BlockGRUCell, DenseGRUCell
 
-Begin = Callable[[int, Tensor, Tensor], tuple[Tensor, ...]]
+StepStart = Callable[[int, Tensor, Tensor], tuple[Tensor, ...]]
 """Function of a step's index and the latents after the step before that returns the latents the step starts from."""
 CONTEXT = "context"
 """Key of a record's latents *before* its observation: ``belief`` and ``state``, packed."""
@@ -295,7 +295,7 @@ class RSSM(nn.Module):
             Belief ``(N, D)`` and state ``(N, S)``.
         """
         belief = self.advance(previous_action, is_init, belief, state)
-        return belief, self.take_in(belief, embedding, deterministic)
+        return belief, self.posterior_state(belief, embedding, deterministic)
 
     def advance(self, previous_action: Tensor, is_init: Tensor, belief: Tensor, state: Tensor) -> Tensor:
         """Return the next belief ``(N, D)``, which needs no observation; arguments as in ``observe_step``."""
@@ -303,7 +303,7 @@ class RSSM(nn.Module):
         action = self._project_action(previous_action, reset)
         return self.cell(torch.where(reset, start[0], belief), torch.where(reset, start[1], state), action)
 
-    def take_in(self, belief: Tensor, embedding: Tensor, deterministic: bool = False) -> Tensor:
+    def posterior_state(self, belief: Tensor, embedding: Tensor, deterministic: bool = False) -> Tensor:
         """Return the posterior state ``(N, S)`` for the next belief and an embedding, as in ``observe_step``."""
         noise = None if deterministic else self.draw_noise(len(belief))
         return self._sample(self.posterior_logits(belief, embedding), noise)
@@ -335,7 +335,7 @@ class RSSM(nn.Module):
         low = autocast_type(belief.device.type) if self.few_kernels and self.sampled else None
         return low or belief.dtype
 
-    def _begin_steps(self, resets: Tensor, start: tuple[Tensor, Tensor]) -> Begin:
+    def _begin_steps(self, resets: Tensor, start: tuple[Tensor, Tensor]) -> StepStart:
         """Return the function that replaces the latents before a step by an episode's start where it is reset.
 
         ``torch.where`` takes one kernel forward and four backward, which make the zero gradients of the other choice;
@@ -352,7 +352,9 @@ class RSSM(nn.Module):
             for begins, goes_on, before in zip(starts, kept, latents, strict=True)
         )
 
-    def imagine_low(self, belief: Tensor, features: Tensor, action: Tensor, noise: Tensor, following: Tensor) -> Tensor:
+    def imagine_few_kernels(
+        self, belief: Tensor, features: Tensor, action: Tensor, noise: Tensor, following: Tensor
+    ) -> Tensor:
         """Do the same as ``imagine_step``, but cast latents only once, and write them into a given tensor.
 
         Args:

@@ -32,7 +32,7 @@ _STATE, _MOTORS = struct.Struct("<18d"), struct.Struct("<4f")
 _STAMP = 1.0  # s, constant: the firmware paces its clock by timestamps, and loses the radio if they jitter
 
 
-class Dialect(NamedTuple):
+class PacketConvention(NamedTuple):
     """Conventions of a firmware's packets.
 
     Args:
@@ -45,11 +45,11 @@ class Dialect(NamedTuple):
     yaw_rate_sign: float
 
 
-DIALECTS = {"2026.6": Dialect((0, 1, 2, 3), 1.0), "before": Dialect((1, 2, 3, 0), -1.0)}
+CONVENTIONS = {"2026.6": PacketConvention((0, 1, 2, 3), 1.0), "before": PacketConvention((1, 2, 3, 0), -1.0)}
 """By the firmware's version: 2026.6 and later, or before."""
 
 
-def dialect_of(release: str) -> Dialect:
+def convention_of(release: str) -> PacketConvention:
     """Return the packet conventions of a release.
 
     Args:
@@ -58,30 +58,30 @@ def dialect_of(release: str) -> Dialect:
     Raises:
         ValueError: It is not the number of a release.
     """
-    if release in DIALECTS:
-        return DIALECTS[release]
+    if release in CONVENTIONS:
+        return CONVENTIONS[release]
     number = re.match(r"(\d+)\.(\d+)", release)
     if number is None:
         raise ValueError(f"betaflight={release}: a release of the firmware, as 4.6 or 2026.6, or before for any older.")
-    return DIALECTS["2026.6" if (int(number[1]), int(number[2])) >= (2026, 6) else "before"]
+    return CONVENTIONS["2026.6" if (int(number[1]), int(number[2])) >= (2026, 6) else "before"]
 
 
-def encode_state(pose: Pose, specific_force: np.ndarray, dialect: Dialect) -> bytes:
+def encode_state(pose: Pose, specific_force: np.ndarray, convention: PacketConvention) -> bytes:
     """Return the state packet for the firmware.
 
     Args:
         pose: Pose of the vehicle.
         specific_force: (3,) m/s², body frame: +9.81 upwards at rest.
-        dialect: The firmware's packet conventions.
+        convention: The firmware's packet conventions.
     """
     x, y, z = pose.body_rates
-    rates = (x, -y, dialect.yaw_rate_sign * z)
+    rates = (x, -y, convention.yaw_rate_sign * z)
     pressure = 101325.0 * (1.0 - 2.25577e-5 * pose.position[2]) ** 5.25588  # Pa, standard atmosphere
     vectors = (rates, -specific_force, pose.attitude, pose.linear_velocity, pose.position)
     return _STATE.pack(_STAMP, *(float(number) for vector in vectors for number in vector), pressure)
 
 
-def decode_motors(data: bytes, dialect: Dialect) -> np.ndarray | None:
+def decode_motors(data: bytes, convention: PacketConvention) -> np.ndarray | None:
     """Return the motor commands (4,) in [0, 1] by rotor; None if the packet is invalid."""
     if len(data) != _MOTORS.size:
         return None
@@ -89,7 +89,7 @@ def decode_motors(data: bytes, dialect: Dialect) -> np.ndarray | None:
     if not np.isfinite(motors).all():
         return None
     rotors = np.empty(4)
-    rotors[list(dialect.rotors)] = motors.clip(0.0, 1.0)
+    rotors[list(convention.rotors)] = motors.clip(0.0, 1.0)
     return rotors
 
 
@@ -99,7 +99,7 @@ class BetaflightSitl:
     Args:
         vehicle: The vehicle; its delay and body-rate controller are not used.
         send: Sends a state packet to the firmware.
-        firmware: Its release, see `dialect_of`.
+        firmware: Its release, see `convention_of`.
         timeout: s, of `Failsafe`.
 
     Attributes:
@@ -114,7 +114,7 @@ class BetaflightSitl:
     def __init__(
         self, vehicle: PlantVehicle, send: Callable[[bytes], object], firmware: str, timeout: float = TIMEOUT
     ) -> None:
-        self._vehicle, self._send, self._dialect = vehicle, send, dialect_of(firmware)
+        self._vehicle, self._send, self._convention = vehicle, send, convention_of(firmware)
         self._sent = 0
         self.failsafe = Failsafe(timeout)
         self.received = self.malformed = 0
@@ -129,11 +129,11 @@ class BetaflightSitl:
         if self.failsafe.expire(time):
             self._vehicle.cut()
         self._sent += 1
-        self._send(encode_state(self._vehicle.pose(), self._vehicle.specific_force, self._dialect))
+        self._send(encode_state(self._vehicle.pose(), self._vehicle.specific_force, self._convention))
 
     def take(self, data: bytes, time: float) -> bool:
         """Apply a motor packet; return whether it was valid."""
-        motors = decode_motors(data, self._dialect)
+        motors = decode_motors(data, self._convention)
         if motors is None:
             self.malformed += 1
             return False

@@ -118,16 +118,16 @@ class Radio:
         firmware: The receiving firmware.
 
     Attributes:
-        pulled: Whether it is disconnected, so that packets are lost.
+        disconnected: Whether it is disconnected, so that packets are lost.
     """
 
     def __init__(self, firmware: SteppedFirmware) -> None:
         self._firmware = firmware
-        self.pulled = False
+        self.disconnected = False
 
     def write(self, data: bytes) -> bool:
         """Send a packet to the firmware; report success even if disconnected, as a radio would."""
-        if not self.pulled:
+        if not self.disconnected:
             self._firmware.hear(data)
         return True
 
@@ -177,7 +177,7 @@ class FirmwareStep(LockStep):
             self.disarmed_at = self.elapsed
         self.after_step()
 
-    def get_ready(self, rate: float = 50.0) -> None:
+    def wait_until_ready(self, rate: float = 50.0) -> None:
         """Send disarmed commands until the firmware has found its level and its radio, and would arm."""
         for _ in range(round(READY_AFTER * rate)):
             self._link.send(at_rest())

@@ -21,7 +21,7 @@ from dreamer_racing.plant.delivery import Delivery
 from dreamer_racing.plant.process import Plant
 from dreamer_racing.plant.vehicle import PlantVehicle
 
-BEGAN = 1000.0
+CLOCK_OFFSET = 1000.0
 """s, by the loop's clock, when the plant's physics began: not 0, so that mixing up the clocks shows."""
 
 ENABLE_AFTER = 0.5
@@ -55,11 +55,11 @@ class LockStep:
 
     def now(self) -> float:
         """Return the time by the loop's clock, s."""
-        return BEGAN + self.plant.time
+        return CLOCK_OFFSET + self.plant.time
 
     def sleep_until(self, deadline: float) -> None:
         """Let the plant fly until a time."""
-        self.plant.advance_to(deadline - BEGAN)
+        self.plant.advance_to(deadline - CLOCK_OFFSET)
 
     def send(self, command: Command) -> bytes:
         """Send a command to the plant; return its packet."""
@@ -72,16 +72,16 @@ class LockStep:
         """Return nothing: this vehicle does not report its battery."""
         return []
 
-    def feel(self) -> list[ImuReading]:
+    def read_imu(self) -> list[ImuReading]:
         """Return the present sample of the plant's IMU."""
-        return [ImuReading(self.now(), self.plant.vehicle.feel())]
+        return [ImuReading(self.now(), self.plant.vehicle.read_imu())]
 
     @property
     def refusal(self) -> str:
         """Empty: this vehicle follows all commands."""
         return ""
 
-    def reckon_with(self, voltage: float) -> None:
+    def set_voltage(self, voltage: float) -> None:
         """Do nothing: thrust is sent in SI units."""
 
     def close(self) -> None:

@@ -21,7 +21,7 @@ from dreamer_racing.hil.imu import encode_imu
 from dreamer_racing.hil.inlet import bind
 from dreamer_racing.hil.links.sitl import MSP_PORT, RC_PORT
 from dreamer_racing.hil.links.udp import UdpTransport
-from dreamer_racing.plant.betaflight_sitl import MOTOR_PORT, STATE_PORT, BetaflightSitl, dialect_of
+from dreamer_racing.plant.betaflight_sitl import MOTOR_PORT, STATE_PORT, BetaflightSitl, convention_of
 from dreamer_racing.plant.commands import TIMEOUT, CommandReceiver, Controls
 from dreamer_racing.plant.delivery import Delivery, PoseDelivery
 from dreamer_racing.plant.vehicle import PlantVehicle
@@ -117,7 +117,7 @@ class Plant:
             return
         self._told += 1
         with suppress(OSError):  # a receiver that has gone does not concern the plant
-            self._incoming.sendto(encode_imu(self._told, self.time, self.vehicle.feel()), self.commander)
+            self._incoming.sendto(encode_imu(self._told, self.time, self.vehicle.read_imu()), self.commander)
 
     def _fly_to(self, until: float) -> None:
         if until > self.time:
@@ -142,7 +142,7 @@ class Plant:
         return (
             f"plant: {self.time:.2f} s, {vehicle.gates_passed} gates in order, "
             f"{len(vehicle.lap_times)} laps{f' ({laps} s)' if laps else ''}, "
-            f"crash: {vehicle.fate}, {self.controls.summary()}, "
+            f"crash: {vehicle.crash_description}, {self.controls.summary()}, "
             f"{self._poses.sent} poses sent, {self._poses.dropped} lost{late}"
         )
 
@@ -212,8 +212,8 @@ def check_process(options: ProcessOptions) -> None:
     """
     incoming, outgoing = "command_port", ["pose_port"]
     if options.betaflight is not None:
-        dialect_of(options.betaflight)
-    if name := by_firmware(options):
+        convention_of(options.betaflight)
+    if name := firmware_option(options):
         incoming, outgoing = "motor_port", ["pose_port", "state_port"]
         if options.lock_step or options.speed != 1.0:
             given = getattr(options, name)
@@ -225,7 +225,7 @@ def check_process(options: ProcessOptions) -> None:
             raise ValueError(f"{incoming} and {name} are both {getattr(options, name)}: give each its own.")
 
 
-def by_firmware(options: ProcessOptions) -> str | None:
+def firmware_option(options: ProcessOptions) -> str | None:
     """Return the name of the option that selects flight by a firmware's motors; None if none does."""
     return next((name for name in ("betaflight", "firmware") if getattr(options, name) is not None), None)
 
@@ -257,7 +257,7 @@ def open_sockets(options: ProcessOptions) -> Sockets:
         OSError: A port is in use, or there is no such host.
     """
     check_process(options)
-    port = options.motor_port if by_firmware(options) else options.command_port
+    port = options.motor_port if firmware_option(options) else options.command_port
     incoming = bind(options.host, port)
     poses, state = (UdpTransport(options.host, port) for port in (options.pose_port, options.state_port))
     return Sockets(incoming, poses, state)
@@ -281,7 +281,7 @@ def start_firmware(named: str, options: ProcessOptions, sockets: Sockets, settin
     firmware = Firmware(program, settings, Ports(motors, options.state_port, options.channel_port, options.serial_port))
     try:
         given = options.betaflight
-        if given is not None and dialect_of(given) != dialect_of(firmware.release):
+        if given is not None and convention_of(given) != convention_of(firmware.release):
             raise ValueError(f"betaflight={given}: the firmware says that it is {firmware.release}; leave it out.")
         firmware.start()
         firmware.wait_for_serial()

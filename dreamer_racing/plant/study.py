@@ -26,7 +26,7 @@ SWEEPS: dict[str, tuple[float, ...]] = {
 }
 """Values of each changed parameter, by its field name in `Mismatch` or `Delivery`."""
 
-USUAL = Delivery(rate=200.0, jitter=0.002, packet_loss=0.01, position_noise=0.001, attitude_noise=0.003)
+DEFAULT_DELIVERY = Delivery(rate=200.0, jitter=0.002, packet_loss=0.01, position_noise=0.001, attitude_noise=0.003)
 """Poses as a motion-capture system gives them [choice]; without noise every flight would be the same."""
 
 LONGEST = 60.0
@@ -100,7 +100,7 @@ def _fly(sweep: str, value: float, seed: int) -> StudyFlight:
 
 def fly(flyer: Flyer, track: Track, preset: str, sweep: str, value: float, seed: int) -> StudyFlight:
     """Fly once with one parameter changed."""
-    mismatch, delivery = Mismatch(), dataclasses.replace(USUAL, seed=seed)
+    mismatch, delivery = Mismatch(), dataclasses.replace(DEFAULT_DELIVERY, seed=seed)
     for changed in (mismatch, delivery):
         if hasattr(changed, sweep):
             setattr(changed, sweep, value)

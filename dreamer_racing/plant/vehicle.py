@@ -29,7 +29,7 @@ logger = logging.getLogger(__name__)
 LIFT_OFF = 0.5
 """Share of a drone's weight that commanded thrust must exceed before the stand releases it [choice]."""
 
-BEARS_ITSELF = 0.99
+HOVER_SHARE = 0.99
 """Share of a drone's weight that must be commanded, as long, before the stand lets it sink: hover thrust, rounded."""
 
 STAND_RADIUS = 0.1
@@ -85,7 +85,7 @@ class PlantVehicle:
         armed: Whether motors may turn, by the command now in effect.
         on_stand: Whether the stand still holds it.
         crash: Why it crashed; `CrashCause.NONE` while it has not.
-        fate: The same in words, with its time and whether the drone was disarmed then.
+        crash_description: The same in words, with its time and whether the drone was disarmed then.
         gates_passed: Number of gates passed in order since it was last on the stand.
         lap_times: s, of the laps since then.
 
@@ -154,9 +154,9 @@ class PlantVehicle:
         self._acceleration = np.zeros(3)
         self._lift_off_step: int | None = None
         self.on_stand, self.gates_passed = True, 0
-        self._bears = True  # whether the stand keeps it from sinking, even after release
-        self._bore_itself = 0  # consecutive physics steps with commanded thrust of its full weight
-        self.crash, self.fate = CrashCause.NONE, "none"
+        self._supported = True  # whether the stand keeps it from sinking, even after release
+        self._hover_steps = 0  # consecutive physics steps with commanded thrust of its full weight
+        self.crash, self.crash_description = CrashCause.NONE, "none"
         self.lap_times: list[float] = []
         self._rotor_speed[:], self.armed = 0.0, False
         self._act(at_rest())
@@ -175,7 +175,7 @@ class PlantVehicle:
         mujoco.mju_quat2Mat(rotation, self._qpos[3:])
         return rotation.reshape(3, 3).T @ (self._acceleration + np.array((0.0, 0.0, GRAVITY)))
 
-    def feel(self) -> np.ndarray:
+    def read_imu(self) -> np.ndarray:
         """Return the sample of an IMU at its centre: (6,) body rates, rad/s, and specific force, m/s², body frame."""
         return np.concatenate((self._qvel[3:], self.specific_force))
 
@@ -238,16 +238,16 @@ class PlantVehicle:
             self._by_commands.step(0)
         else:
             self._turn_and_step()
-        if self._bears:
-            bears_itself = self.armed and self._asked() >= BEARS_ITSELF * self.parameters.mass * GRAVITY
-            self._bore_itself = self._bore_itself + 1 if bears_itself else 0
+        if self._supported:
+            hovers = self.armed and self._asked() >= HOVER_SHARE * self.parameters.mass * GRAVITY
+            self._hover_steps = self._hover_steps + 1 if hovers else 0
         if self.on_stand:
             self._hold(self._start)
             self._maybe_let_go()
         elif self.crash is CrashCause.NONE:
-            if self._bears:
-                self._maybe_bear()
-            self._judge()
+            if self._supported:
+                self._support()
+            self._check_race()
         elif not self._qpos[2] > GROUND_HEIGHT:  # also true of NaN
             self._lie()
         self._acceleration = (self._qvel[:3] - before) / self.parameters.physics_dt
@@ -293,14 +293,14 @@ class PlantVehicle:
             self._race.begin(torch.tensor([True]), position, torch.tensor([0]))
             logger.info("plant: the stand let go at %.2f s", self.time)
 
-    def _maybe_bear(self) -> None:
+    def _support(self) -> None:
         """Keep a released drone that does not carry its weight yet from sinking through the stand."""
         away = self._qpos[:3] - self._start[:3]
-        self._bears = self._bore_itself < self._spin_up_steps and math.hypot(*away[:2]) < STAND_RADIUS
-        if self._bears and away[2] < 0.0:
+        self._supported = self._hover_steps < self._spin_up_steps and math.hypot(*away[:2]) < STAND_RADIUS
+        if self._supported and away[2] < 0.0:
             self._qpos[2], self._qvel[2] = self._start[2], max(self._qvel[2], 0.0)
 
-    def _judge(self) -> None:
+    def _check_race(self) -> None:
         """Record the path of a control step, and let the race check it at the end."""
         self._path.append(self._qpos[:3].copy())
         if len(self._path) <= round(self.control_dt / self.parameters.physics_dt):
@@ -315,5 +315,7 @@ class PlantVehicle:
         self.crash = CrashCause(int(outcome.crash))
         if self.crash is not CrashCause.NONE:
             words = self.crash.name.lower().replace("_", " ")
-            self.fate = f"{words} at {self.time:.2f} s" + ("" if self.armed else ", when disarmed")
-            logger.info("plant: crash: %s; it stays there: start the plant again for the next flight", self.fate)
+            self.crash_description = f"{words} at {self.time:.2f} s" + ("" if self.armed else ", when disarmed")
+            logger.info(
+                "plant: crash: %s; it stays there: start the plant again for the next flight", self.crash_description
+            )

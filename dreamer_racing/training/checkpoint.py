@@ -123,7 +123,7 @@ class RunCheckpoints:
         if final == self._last_saved:
             return final
         partial = self.directory / f".{final.name}.partial"
-        processes = {PROCESSES: parallel.count()} if self._own and parallel.count() > 1 else {}
+        processes = {PROCESSES: parallel.num_processes()} if self._own and parallel.num_processes() > 1 else {}
         about = {**(metadata or {}), "env_steps": env_steps, **processes}
         first = parallel.is_first()
         try:
@@ -150,7 +150,7 @@ class RunCheckpoints:
         """Run a step of a save if it is this process's; if all save together, wait for the others."""
         action = action if of_this_process else lambda: None
         if self._own:
-            parallel.together(action)
+            parallel.run_in_all(action)
         else:
             action()
 
@@ -185,10 +185,10 @@ class RunCheckpoints:
         if not self._own:
             return load_components(self.directory if path is None else path, parts, map_location, may_lack)
         looked_at = {*parts, *self._own_names}
-        source = Path(parallel.agreed(_path_of_sound(self.directory if path is None else path, looked_at)))
+        source = Path(parallel.broadcast(_path_of_sound(self.directory if path is None else path, looked_at)))
         metadata = Checkpoint.manifest(source)["metadata"]
         own = {name: part for name, part in parts.items() if name in self._own or name == "random_state"}
-        if (saved := metadata.get(PROCESSES, 1)) != parallel.count():
+        if (saved := metadata.get(PROCESSES, 1)) != parallel.num_processes():
             _load_sound(source, {name: part for name, part in parts.items() if name not in own}, map_location, may_lack)
             self._deal(source, saved)
         elif parallel.is_first():
@@ -204,12 +204,12 @@ class RunCheckpoints:
         Streams are ordered by descending rank, so that rank 0 gets the last ones, which may be held out.
         """
         for name, part in self._own.items():
-            if not hasattr(part, "deal"):
+            if not hasattr(part, "load_shards"):
                 continue
             folders = [source / f"{PROCESS}{rank}" if rank else source for rank in reversed(range(saved))]
             paths = [folder / Checkpoint.manifest(folder)["components"][name]["path"] for folder in folders]
             try:
-                part.deal(paths, skip=(parallel.count() - 1 - parallel.rank()) * part.num_streams)
+                part.load_shards(paths, skip=(parallel.num_processes() - 1 - parallel.rank()) * part.num_streams)
             except (OSError, ValueError) as error:
                 raise RunCheckpointError(f"The checkpoint {source} could not be restored. {error}") from error
         logger.info(
@@ -217,7 +217,7 @@ class RunCheckpoints:
             "numbers and steps kept for the next improvement begin anew.",
             source.name,
             saved,
-            parallel.count(),
+            parallel.num_processes(),
         )
 
     def _remove_later(self, newest: Path) -> None:

@@ -224,7 +224,7 @@ def complete_checkpoints(path: str | Path) -> list[Path]:
     if is_complete(path):
         return [path]
     for directory in (path / CHECKPOINTS, path):
-        aside = [path for path in directory.glob(f".{PREFIX}-*{REPLACED}") if not stepped_aside(path).exists()]
+        aside = [path for path in directory.glob(f".{PREFIX}-*{REPLACED}") if not original_path(path).exists()]
         candidates = sorted([*directory.glob(f"{PREFIX}-*"), *aside], key=env_steps_of, reverse=True)
         found = [candidate for candidate in candidates if is_complete(candidate)]
         for candidate in candidates:
@@ -247,14 +247,14 @@ def complete_checkpoints(path: str | Path) -> list[Path]:
     )
 
 
-def stepped_aside(path: Path) -> Path:
+def original_path(path: Path) -> Path:
     """Return the path that a checkpoint had before it was renamed for its replacement."""
     return path.with_name(path.name.removeprefix(".").removesuffix(REPLACED))
 
 
 def env_steps_of(checkpoint: Path) -> int:
     """Return the env_steps in a checkpoint's name; -1 if there are none."""
-    number = stepped_aside(checkpoint).name.rpartition("-")[2]
+    number = original_path(checkpoint).name.rpartition("-")[2]
     return int(number) if number.isdecimal() else -1
 
 

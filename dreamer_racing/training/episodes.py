@@ -15,10 +15,10 @@ from torch import Tensor
 
 MEMORY = 200
 """Attempts at a gate over which its pass rate is a running mean [choice]; its standard error is then about 0.03."""
-KNOWN = 0.4
+KNOWN_PASS_RATE = 0.4
 """Pass rate of the gate with the lowest one above which the whole lap counts as known [choice]."""
-PACE = 3.0
-"""Minimum increase of `GatePassRate.known` per length of the run, once the lap is known [choice]: 0.4 in 200,000 of
+MIN_PROGRESS_RATE = 3.0
+"""Minimum increase of `GatePassRate.progress` per length of the run, once the lap is known [choice]: 0.4 in 200,000 of
 1,500,000 env_steps."""
 
 
@@ -140,7 +140,7 @@ class GatePassRate:
     Attributes:
         best: Highest value of the lowest rate since the decayed number of attempts of each gate reached half of
             `MEMORY`; 0 before. It never falls, so schedules that depend on it do not oscillate.
-        known_since: env_steps at which `best` reached `KNOWN`; None before.
+        known_since: env_steps at which `best` reached `KNOWN_PASS_RATE`; None before.
 
     Example:
         >>> from tensordict import TensorDict
@@ -183,12 +183,12 @@ class GatePassRate:
         self._attempts = kept * self._attempts + attempts
         if self._attempts.min() >= MEMORY / 2:
             self.best = max(self.best, self.share)
-        if self.known_since is None and self.best >= KNOWN:
+        if self.known_since is None and self.best >= KNOWN_PASS_RATE:
             self.known_since = env_steps
         return self.share
 
-    def known(self, env_steps: int, total_env_steps: int) -> float:
-        """Return the larger of `best` and a value that rises linearly with env_steps from `KNOWN` once it is reached.
+    def progress(self, env_steps: int, total_env_steps: int) -> float:
+        """Return the larger of `best` and a value that rises linearly from `KNOWN_PASS_RATE` once `best` reached it.
 
         This prevents a deadlock: if gates are only missed because of a large standard deviation of actions, their pass
         rate does not rise until the schedule lowers that standard deviation.
@@ -199,7 +199,7 @@ class GatePassRate:
         """
         if self.known_since is None:
             return self.best
-        return max(self.best, KNOWN + PACE * (env_steps - self.known_since) / total_env_steps)
+        return max(self.best, KNOWN_PASS_RATE + MIN_PROGRESS_RATE * (env_steps - self.known_since) / total_env_steps)
 
     @property
     def shares(self) -> torch.Tensor:
@@ -212,7 +212,7 @@ class GatePassRate:
         return float(self.shares.min()) if len(self._passes) else 0.0
 
     @property
-    def hardest_gate(self) -> int:
+    def lowest_rate_gate(self) -> int:
         """Index of the gate with the lowest pass rate, in the order of the track."""
         return int(self.shares.argmin())
 

@@ -99,17 +99,17 @@ class Progress:
         if self._table is not None:
             self._table.evaluating(episodes, total)
 
-    def say(self, text: str) -> None:
+    def write_line(self, text: str) -> None:
         """Write a message on its own line."""
         if self._table is not None:
             self._table.write(text)
         elif self._shown:
             _write(text, sys.stdout)
 
-    def answer(self, text: str) -> None:
+    def write_from_handler(self, text: str) -> None:
         """Write a message on its own line from within a signal handler."""
         if self._table is not None:
-            self._table.answer(text)
+            self._table.write_from_handler(text)
         else:
             say_at_once(text)
 
@@ -204,7 +204,7 @@ class LiveTable:
         with self._drawing():
             self._bar.write(text, file=file)
 
-    def answer(self, text: str) -> None:
+    def write_from_handler(self, text: str) -> None:
         """Write a line above the bar from within a signal handler; during drawing, write it afterwards."""
         if self._draws:
             self._answers.append(text)
@@ -230,7 +230,7 @@ class LiveTable:
         finally:
             self._draws = False
             while self._answers:
-                self.answer(self._answers.pop())
+                self.write_from_handler(self._answers.pop())
 
     def _note(self, refresh: bool = True) -> None:
         """Show the time left and the failing writes beside the bar."""

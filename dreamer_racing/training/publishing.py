@@ -16,7 +16,7 @@ from pathlib import Path
 import torch
 from torchrl.checkpoint import Checkpoint, StateDictCheckpointAdapter
 
-from dreamer_racing.training.directory import PREFIX, PROCESS, PROCESSES, REPLACED, is_complete, stepped_aside
+from dreamer_racing.training.directory import PREFIX, PROCESS, PROCESSES, REPLACED, is_complete, original_path
 
 logger = logging.getLogger(__name__)
 
@@ -72,7 +72,7 @@ def remove(path: Path) -> None:
 def remove_unfinished(directory: Path) -> None:
     """Remove unfinished checkpoints of a killed process; restore one that was renamed for a missing replacement."""
     for path in directory.glob(f".*{PREFIX}-*"):
-        final = stepped_aside(path)
+        final = original_path(path)
         if path.name.endswith(REPLACED) and not final.exists() and is_complete(path):
             os.replace(path, final)
         else:

@@ -27,7 +27,7 @@ logger = logging.getLogger(__name__)
 
 ERRORS = ("privileged_error", "image_error", "loss_vector", "reward_error")
 """Metrics of a world model by which a lag can be measured, best first."""
-LOOKS = 5
+MEDIAN_WINDOW = 5
 """Number of latest measurements whose median is used, so that a single unusual flight does not count [choice]."""
 PATIENCE = 10
 """Maximum number of measurements that a policy waits; it waits again only after the ratio fell below the limit
@@ -39,7 +39,7 @@ class RampClock(Enum):
 
     run = "run"  # share of the run's env_steps
     passes = "passes"  # best pass rate of the gate with the lowest pass rate, `GatePassRate.best`
-    known = "known"  # the same, but also rises with time once that rate reached `KNOWN`, `GatePassRate.known`
+    known = "known"  # the same, but also rises with time once that rate is high enough, `GatePassRate.progress`
 
 
 @dataclass
@@ -136,7 +136,7 @@ class ScheduleConfig:
                 raise ValueError(
                     f"schedule.{name}.by={ramp.by.value} goes by gates, and env.suite={suite} has none: by=run."
                 )
-            allowed = POSITIVE if name in SHARES_OF_RATES else allowed_values(owner_of(name, owners), name)
+            allowed = POSITIVE if name in RATE_FACTORS else allowed_values(owner_of(name, owners), name)
             if allowed is not None and ramp.to not in allowed:
                 raise ValueError(f"schedule.{name}.to={ramp.to}: must be {allowed}.")
         self.check_deviations(owners["loss"])
@@ -200,9 +200,9 @@ class LatentPPOScheduleConfig(ScheduleConfig):
                 )
 
 
-SHARES_OF_RATES = ("learning_rates", "world_model_rate")
+RATE_FACTORS = ("learning_rates", "world_model_rate")
 """Ramps of factors, which start at 1 instead of a configured value."""
-ALWAYS = (*SHARES_OF_RATES, "min_std", "max_std", "kl_target")
+ALWAYS = (*RATE_FACTORS, "min_std", "max_std", "kl_target")
 """Hyperparameters that are always set, even without a ramp. The networks hold the bounds of standard deviations, so
 a checkpoint of another run may bring other bounds, which this run's must replace."""
 
@@ -235,7 +235,7 @@ class Schedule:
         self.ramps: dict[str, tuple[float, Ramp]] = {}
         for name, ramp in config.ramps.items():
             if ramp.to is not None or name in ALWAYS:
-                own = 1.0 if name in SHARES_OF_RATES else getattr(owner_of(name, owners), name)
+                own = 1.0 if name in RATE_FACTORS else getattr(owner_of(name, owners), name)
                 if own is not None:
                     self.ramps["rates" if name == "learning_rates" else name] = (own, ramp)
         self.total_env_steps = total_env_steps
@@ -251,14 +251,14 @@ class Schedule:
         if not len(episodes) or "gates_passed" not in episodes:
             return {}
         share = self.pass_rate.update(episodes, env_steps)
-        return {"episode/pass_share": share, "episode/hardest_gate": float(self.pass_rate.hardest_gate)}
+        return {"episode/pass_share": share, "episode/hardest_gate": float(self.pass_rate.lowest_rate_gate)}
 
     def at(self, env_steps: int) -> dict[str, float]:
         """Return all scheduled hyperparameters at ``env_steps``, by their names in a learner's ``adjust``."""
         times = {
             RampClock.run: env_steps / self.total_env_steps,
             RampClock.passes: self.pass_rate.best,
-            RampClock.known: self.pass_rate.known(env_steps, self.total_env_steps),
+            RampClock.known: self.pass_rate.progress(env_steps, self.total_env_steps),
         }
         return {name: ramp.at(value, times) for name, (value, ramp) in self.ramps.items()}
 
@@ -341,8 +341,8 @@ class ModelLag:
     Example:
         >>> import torch
         >>> lag = ModelLag(limit=1.2)
-        >>> lag.trained({"reward_error": torch.tensor(0.01)})
-        >>> lag.measured({"reward_error": torch.tensor(0.02)})["lag/ratio"]
+        >>> lag.add_training_error({"reward_error": torch.tensor(0.01)})
+        >>> lag.add_fresh_error({"reward_error": torch.tensor(0.02)})["lag/ratio"]
         2.0
         >>> lag.waits
         True
@@ -354,7 +354,7 @@ class ModelLag:
         self._periods = 0  # number of the latest period
         self._sum: Tensor | float = 0.0  # sum of training errors since the last measurement
         self._count = 0
-        self._ratios = deque[float](maxlen=LOOKS)
+        self._ratios = deque[float](maxlen=MEDIAN_WINDOW)
         self._above = 0  # consecutive measurements with a median above the limit
 
     @property
@@ -368,13 +368,13 @@ class ModelLag:
         passed, self._periods = self.limit is not None and periods != self._periods, periods
         return passed
 
-    def trained(self, metrics: Mapping[str, Tensor]) -> None:
+    def add_training_error(self, metrics: Mapping[str, Tensor]) -> None:
         """Add the error in an update's metrics, without waiting for the device."""
         if self.limit is not None and (error := error_of(metrics)) is not None:
             self._sum = self._sum + error.detach()
             self._count += 1
 
-    def measured(self, metrics: Mapping[str, Tensor]) -> dict[str, Tensor | float]:
+    def add_fresh_error(self, metrics: Mapping[str, Tensor]) -> dict[str, Tensor | float]:
         """Add the error on the newest records, decide whether the policy waits, and log changes of the decision.
 
         Args:
@@ -413,7 +413,7 @@ class ModelLag:
         """Restore what ``state_dict`` returned."""
         self._periods = state_dict["periods"]
         self._sum, self._count = torch.tensor(state_dict["sum"]), state_dict["count"]
-        self._ratios = deque(state_dict["ratios"], maxlen=LOOKS)
+        self._ratios = deque(state_dict["ratios"], maxlen=MEDIAN_WINDOW)
         self._above = state_dict["above"]
 
 

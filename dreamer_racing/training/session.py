@@ -40,7 +40,7 @@ logger = logging.getLogger(__name__)
 
 OF_EACH_PROCESS = ("env", "tracker", "collector", "replay", "storage")
 """Parts that differ between processes; `storage` holds collected steps of the process's environments."""
-OF_WORLDS = ("env", "collector")
+ENVIRONMENT_PARTS = ("env", "collector")
 """Parts that a run with workers does not have; if a checkpoint lacks them, the environments are reset on resume."""
 
 FIRST_CHECKPOINT = 1.5
@@ -113,11 +113,11 @@ class Session:
         self.config = config
         self.directory = RunDirectory(lock.directory)
         self.counters = {"env_steps": 0, "updates": 0, "episodes": 0}
-        self.clock = RunClock(self.counters, alone=parallel.count() == 1)
+        self.clock = RunClock(self.counters, alone=parallel.num_processes() == 1)
         self.began = False
         self.parts: dict[str, Any] = {}
         self.metrics = UnwrittenMetrics()
-        self.say: Callable[[str], None] = logger.info
+        self.write_line: Callable[[str], None] = logger.info
         self._lock, self._note_start, self._make_loggers = lock, note_start, make_loggers
         every = {"log": config.logger.every, "evaluate": config.evaluation.every, "save": config.checkpoint.every}
         self._periods = Periods({"evaluate": config.evaluation.first}, **every)
@@ -184,13 +184,13 @@ class Session:
         path, resume = self.directory.path, self.config.resume
         self.checkpoints = RunCheckpoints(path, self.parts, self.config.checkpoint.keep, OF_EACH_PROCESS)
         if resume:
-            self.clock.total = self.checkpoints.load(resume, may_lack=(*may_lack, *OF_WORLDS))
+            self.clock.total = self.checkpoints.load(resume, may_lack=(*may_lack, *ENVIRONMENT_PARTS))
             updates = self.counters["updates"]
             logger.info("resumed %s at %s env_steps, %s updates", resume, f"{self.env_steps:,}", f"{updates:,}")
             rollouts.begin_at(self.env_steps)
         kept = ("learner", "counters", *best)
         self.best = BestCheckpoint(path, {name: self.parts[name] for name in kept}, self.env_steps)
-        parallel.together(lambda: None)  # a barrier: all have read the files that are now rewritten
+        parallel.run_in_all(lambda: None)  # a barrier: all have read the files that are now rewritten
         if parallel.is_first():
             self.directory.set_aside_after(self.env_steps)
             self._note_start(self.env_steps)
@@ -243,10 +243,10 @@ class Session:
     def _count(self, rollout: TensorDictBase | None, saves: bool = False) -> None:
         """Count a rollout that is about to be delivered, and decide whether to save after it."""
         if rollout is not None:
-            self.counters["env_steps"] += rollout.numel() * parallel.count()
+            self.counters["env_steps"] += rollout.numel() * parallel.num_processes()
             self._progress.advance(self.env_steps, self.counters["updates"])
         by_steps = self._periods.due("save", self.env_steps)
-        by_minutes = parallel.agreed(self._minutes.due())  # not short-circuited: both must be updated
+        by_minutes = parallel.broadcast(self._minutes.due())  # not short-circuited: both must be updated
         self._saves = saves or by_steps or by_minutes
         self._due = {}
         self._another_follows = False
@@ -257,7 +257,7 @@ class Session:
         Returns:
             Finished episodes, batch ``[E]`` of `EpisodeTracker.update`.
         """
-        episodes = parallel.gathered_rows(self.tracker.update(rollout))
+        episodes = parallel.all_gather_rows(self.tracker.update(rollout))
         self.counters["episodes"] += len(episodes)
         self.metrics.push(self.tracker.summary(episodes), len(episodes))
         self.metrics.push(self.collected.metrics())
@@ -310,7 +310,7 @@ class Session:
         names = {"gates": "gates_per_episode", "success": "success_rate", "return": "return_mean"}
         shown = {label: metrics.get(f"evaluation/{name}") for label, name in names.items()}
         numbers = ", ".join(f"{label} {value:.2f}" for label, value in shown.items() if value is not None)
-        self.say(f"evaluation at {self.env_steps:,} env_steps: {numbers}{best}")
+        self.write_line(f"evaluation at {self.env_steps:,} env_steps: {numbers}{best}")
 
     @contextmanager
     def undisturbed(self) -> Iterator[None]:
@@ -352,8 +352,8 @@ class Session:
             yield
         except (OSError, RunCheckpointError) as error:
             self._unsaved.setdefault(what, self.env_steps)
-            said = str(error).rstrip(".")
-            self.say(f"NOT SAVED: {what}: {said}. The run goes on, and tries again when the next is due.")
+            reason = str(error).rstrip(".")
+            self.write_line(f"NOT SAVED: {what}: {reason}. The run goes on, and tries again when the next is due.")
         else:
             self._unsaved.pop(what, None)
 
@@ -387,8 +387,8 @@ class Session:
         total, shown = self.config.total_env_steps, parallel.is_first()
         begun = self.env_steps, self.counters["updates"]
         self._progress = self._stack.enter_context(Progress(total, *begun, shown=shown))
-        self._stop.say = self._progress.answer
-        self.say, self.evaluator.on_episode = self._progress.say, self._progress.evaluating
+        self._stop.write = self._progress.write_from_handler
+        self.write_line, self.evaluator.on_episode = self._progress.write_line, self._progress.evaluating
         self.evaluator.attempt = self.attempt
         self.collected.stopping = lambda: self._stop.signal_name is not None
         if shown and self.directory.finished_env_steps() > self.env_steps:
@@ -399,11 +399,11 @@ class Session:
         saved = self.save()
         if self.stopping:
             at = f"at {self.env_steps:,} of {self.config.total_env_steps:,} env_steps"
-            self.say(f"{self._stop.signal_name} {at}: saved; continue with resume={self.directory.path}")
+            self.write_line(f"{self._stop.signal_name} {at}: saved; continue with resume={self.directory.path}")
         elif parallel.is_first():
             self.metrics.flush()
             self.directory.mark_finished(self.env_steps)
-        self.say(f"checkpoint: {saved}")
+        self.write_line(f"checkpoint: {saved}")
         self._stack.close()
         if self._stop.signal_name:
             raise SystemExit(128 + signal.Signals[self._stop.signal_name])
@@ -412,4 +412,4 @@ class Session:
 def graceful_exit() -> GracefulExit:
     """Make the stop flag that a signal sets in all processes; only rank 0 prints an answer."""
     answer = "saving; again: abandons what is since the last checkpoint" if parallel.is_first() else ""
-    return GracefulExit(answer, parallel.largest if parallel.count() > 1 else None)
+    return GracefulExit(answer, parallel.all_reduce_max if parallel.num_processes() > 1 else None)

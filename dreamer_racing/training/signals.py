@@ -30,7 +30,7 @@ class GracefulExit:
             Then reading `requested` is a collective operation, so all processes must read it equally often.
 
     Attributes:
-        say: Function that prints the answer from within the handler, which may have interrupted a write to a stream.
+        write: Function that prints the answer from within the handler, which may have interrupted a write to a stream.
 
     Example:
         >>> with GracefulExit() as stop:
@@ -39,7 +39,7 @@ class GracefulExit:
     """
 
     def __init__(self, answer: str = "", agree: Callable[[int], int] | None = None) -> None:
-        self.say: Callable[[str], None] = say_at_once
+        self.write: Callable[[str], None] = say_at_once
         self._answer = answer
         self._agree = agree
         self._arrived = 0  # number of the signal that this process received
@@ -79,7 +79,7 @@ class GracefulExit:
         if not self._agree:
             self.signal_name = name
         if self._answer:
-            self.say(f"{name}: {self._answer}")
+            self.write(f"{name}: {self._answer}")
 
 
 def say_at_once(text: str) -> None:

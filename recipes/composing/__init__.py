@@ -6,12 +6,12 @@ from composing.messages import end_quietly, refuse_without_packages
 
 refuse_without_packages()  # before anything imports them
 
-from composing.options import answer_early  # noqa: E402
+from composing.options import handle_help_and_typos  # noqa: E402
 from dreamer_racing.caches import CacheError, ensure_caches  # noqa: E402
 from dreamer_racing.terminal import take_any_terminal  # noqa: E402
 
 take_any_terminal()
-answer_early()  # before torch is imported, which takes seconds
+handle_help_and_typos()  # before torch is imported, which takes seconds
 try:
     ensure_caches()  # before Matplotlib is loaded
 except CacheError as error:

@@ -16,7 +16,7 @@ from omegaconf import DictConfig, OmegaConf
 from torch import Tensor
 from torchrl.collectors import Collector
 
-from composing.saved import SEEN, read_yaml
+from composing.saved import OBSERVATION_SETTINGS, read_yaml
 from composing.schema import (
     EnvConfig,
     LatentPPORunConfig,
@@ -69,7 +69,7 @@ if TYPE_CHECKING:
 Environment: TypeAlias = "DroneRacingEnv | ControlSuiteEnv"
 
 
-def describe_file(track: str) -> str | None:
+def serialize_track_file(track: str) -> str | None:
     """Return the contents of a track file as JSON, to be saved with a run; None for a built-in track."""
     if track in BUILTIN_TRACKS:
         return None
@@ -82,9 +82,9 @@ def worlds_device(device: torch.device, env: EnvConfig) -> str:
     return str(device) if device.type == "cuda" and fits else "cpu"
 
 
-def worlds_of(config: RunConfig) -> dict[str, Any]:
+def shared_env_arguments(config: RunConfig) -> dict[str, Any]:
     """Return the arguments that all `DroneRacingEnv`s of the run share, in training and evaluation."""
-    return {"track": config.track_as_begun(), **config.env.arguments()}
+    return {"track": config.saved_track(), **config.env.arguments()}
 
 
 def make_env(config: RunConfig, num_envs: int | None = None, num_threads: int | None = None) -> Environment:
@@ -104,7 +104,7 @@ def make_env(config: RunConfig, num_envs: int | None = None, num_threads: int | 
             seed=config.seed,
             num_threads=num_threads,
             **config.env.training_arguments(),
-            **worlds_of(config),
+            **shared_env_arguments(config),
         )
     if readers:
         raise ValueError(
@@ -149,7 +149,7 @@ def make_evaluator(
 ) -> Evaluator:
     """Make the evaluator for the run's environment; in a race, `options` go to `EvaluationReport`."""
     if is_race(config):
-        worlds = {**worlds_of(config), "start_noise": start_noise}
+        worlds = {**shared_env_arguments(config), "start_noise": start_noise}
         return EvaluationReport(directory, learner, worlds, episodes, video_steps, **options)
     seed = config.seed + 1
     env = make_suite(config, min(8, episodes), seed)
@@ -171,7 +171,7 @@ def make_agent(config: WorldModelRunConfig, interface: Interface) -> Agent:
     return Agent(size_of(config), interface, decodes, config.loss.min_std, config.loss.max_std).to(config.device)
 
 
-def begin_with(learner: WorldModelLearner, config: WorldModelRunConfig, env: Environment) -> str:
+def load_initial_weights(learner: WorldModelLearner, config: WorldModelRunConfig, env: Environment) -> str:
     """Load the weights that ``init_from`` names into a new learner; return a log line that describes them.
 
     Raises:
@@ -183,7 +183,7 @@ def begin_with(learner: WorldModelLearner, config: WorldModelRunConfig, env: Env
     folder = existing_agent_path("init_from", source)
     if not is_agent(folder):
         saved = read_yaml(RunDirectory.of(latest_checkpoint(folder)).config, DictConfig)
-        for name in SEEN:
+        for name in OBSERVATION_SETTINGS:
             there, here = OmegaConf.select(saved, name), OmegaConf.select(OmegaConf.structured(config), name)
             if there != here:
                 raise ValueError(f"{name}={here}: init_from={source} was trained with {name}={there}; give that.")
@@ -191,9 +191,9 @@ def begin_with(learner: WorldModelLearner, config: WorldModelRunConfig, env: Env
         unmatched = learner.adopt(state)
         kind = "the averaged ones" if "averaged" in state else "all those"
         line = f"weights: {kind} of {folder} at {metadata['env_steps']:,} env_steps (init_from=), heads and critic, too"
-        if unmatched.anew:
-            line += f"; {' and '.join(unmatched.anew)}, which that run had not, begins anew"
-        return line + (f"; left behind: {' and '.join(unmatched.left)}" if unmatched.left else "")
+        if unmatched.initial:
+            line += f"; {' and '.join(unmatched.initial)}, which that run had not, begins anew"
+        return line + (f"; left behind: {' and '.join(unmatched.unused)}" if unmatched.unused else "")
     contract = read_contract(folder / CONTRACT)
     check_size(contract["model"], learner.size)
     if not isinstance(env, DroneRacingEnv):
@@ -250,7 +250,7 @@ def measure_lag(
     if (windows := replay.newest(length)) is None:
         return {}
     with session.undisturbed():
-        return lag.measured(parallel.averaged(world_model_metrics(learner, windows)))
+        return lag.add_fresh_error(parallel.averaged(world_model_metrics(learner, windows)))
 
 
 def seed_generators(seed: int) -> None:
@@ -320,7 +320,7 @@ def make_run_replay(
         files.mkdir(parents=True, exist_ok=True)
     where = f"memory of {device}" if files is None else f"files below {files}, until the process ends"
     print(f"replay: {settings.capacity:,} records, {size / 1e9:.1f} GB when full, in {where}")
-    print(disk_needed(config, round(size * min(parallel.count(), config.total_env_steps / settings.capacity))))
+    print(disk_needed(config, round(size * min(parallel.num_processes(), config.total_env_steps / settings.capacity))))
     windows = {}
     if isinstance(settings, SequenceReplayConfig):
         windows = {name: getattr(settings, name) for name in ("recent_share", "recent_records", "held_out")}
@@ -345,11 +345,11 @@ def make_run_replay(
 
 def check_room(size: int, capacity: int, device: str, files: Path | None) -> None:
     """Refuse replays that do not all fit; each process has one of `size` bytes and `capacity` records."""
-    asked = f"replay.capacity={capacity * parallel.count():,}"
+    asked = f"replay.capacity={capacity * parallel.num_processes():,}"
     if files is not None:
-        check_space(size * parallel.count(), files, asked)
+        check_space(size * parallel.num_processes(), files, asked)
     else:
-        check_fits(size * parallel.count_here() if device == "cpu" else size, device, asked)
+        check_fits(size * parallel.num_local_processes() if device == "cpu" else size, device, asked)
 
 
 def disk_needed(config: ReplayRunConfig, replay: int) -> str:
@@ -375,4 +375,4 @@ def make_run_evaluator(config: RunConfig, directory: Path, learner: Learner) -> 
 
 def make_tracker(config: RunConfig) -> EpisodeTracker:
     """Make the tracker of finished episodes in this process's worlds."""
-    return EpisodeTracker(config.env.num_envs // parallel.count(), CrashCause if is_race(config) else None)
+    return EpisodeTracker(config.env.num_envs // parallel.num_processes(), CrashCause if is_race(config) else None)

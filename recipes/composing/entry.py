@@ -20,7 +20,7 @@ from hydra.errors import HydraException
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import MissingMandatoryValue, OmegaConfBaseException
 
-from composing.messages import INTERRUPTED, follows, say_error
+from composing.messages import INTERRUPTED, is_follower_rank, say_error
 from composing.options import CONFIG_DIR, FLAGS, no_such_choice, no_such_setting
 from dreamer_racing.envs.simulator.opengl import RendererUnavailableError
 from dreamer_racing.settings import check_settings
@@ -83,7 +83,7 @@ def override_key(override: str) -> str:
 def as_override(name: str, text: str | Path) -> str:
     """Return an override that hydra parses as exactly this text, quoted if needed."""
     plain, quoted = (f"{name}={word}" for word in (text, QuotedString(str(text), Quote.single).with_quotes()))
-    return plain if hydra_takes(plain) and override_value(plain) == str(text) else quoted
+    return plain if is_parsable(plain) and override_value(plain) == str(text) else quoted
 
 
 def override_value(override: str) -> object:
@@ -91,7 +91,7 @@ def override_value(override: str) -> object:
     return OverridesParser.create().parse_override(override).value()
 
 
-def hydra_takes(override: str) -> bool:
+def is_parsable(override: str) -> bool:
     """Return whether hydra can parse an override."""
     try:
         override_value(override)
@@ -151,7 +151,7 @@ def recipe(
         def with_typed(config: DictConfig) -> None:
             if logs:
                 start_logging()
-            function(typed(config))
+            function(to_checked_object(config))
 
         task = function if composed else with_typed
         main = hydra.main(version_base="1.3", config_path=str(CONFIG_DIR), config_name=name)(task)
@@ -159,7 +159,7 @@ def recipe(
         @functools.wraps(function)
         def start() -> None:
             sys.excepthook = sys.__excepthook__  # imports are done: `end_quietly` is no longer needed
-            sys.argv[1:] = [readable(FLAGS.get(argument, argument)) for argument in sys.argv[1:]]
+            sys.argv[1:] = [normalise_argument(FLAGS.get(argument, argument)) for argument in sys.argv[1:]]
             os.environ.setdefault("HYDRA_FULL_ERROR", "1")  # raise errors, instead of hydra's own report
             try:
                 main()
@@ -167,7 +167,7 @@ def recipe(
                 say_error(in_plain_words(error, name, sys.argv[1:]))
                 raise SystemExit(2) from error
             except KeyboardInterrupt as interrupt:
-                if not follows():
+                if not is_follower_rank():
                     print(INTERRUPTED, file=sys.stderr)
                 raise SystemExit(128 + signal.SIGINT) from interrupt
 
@@ -176,7 +176,7 @@ def recipe(
     return decorate
 
 
-def typed(config: DictConfig) -> Any:
+def to_checked_object(config: DictConfig) -> Any:
     """Return a configuration as an object of its dataclass; refuse missing, out-of-range and inconsistent settings."""
     with plain_errors():
         settings: Any = OmegaConf.to_object(config)
@@ -195,7 +195,7 @@ def schema_alone(name: str) -> dict[str, Any]:
     }
 
 
-def readable(argument: str) -> str:
+def normalise_argument(argument: str) -> str:
     """Return an argument, rewritten if hydra would misread or refuse it.
 
     Whole numbers such as 1e6, also in comma-separated lists, are written out in digits, since hydra reads a float. Text
@@ -206,7 +206,7 @@ def readable(argument: str) -> str:
     if not equals:
         return argument
     if override_key(argument) in TEXTS:
-        known = hydra_takes(argument) or set(value) & set(",[]{}'\"")
+        known = is_parsable(argument) or set(value) & set(",[]{}'\"")
         return argument if known else as_override(name, os.path.expanduser(value))
     return f"{name}={','.join(map(_in_digits, value.split(',')))}"
 

@@ -26,7 +26,14 @@ from composing.entry import (
 )
 from composing.options import command
 from composing.resolving import tune
-from composing.saved import SEEN, changed_settings, keep_saved, read_yaml, saved_config, settings_of
+from composing.saved import (
+    OBSERVATION_SETTINGS,
+    changed_settings,
+    read_yaml,
+    restore_saved_settings,
+    saved_config,
+    settings_of,
+)
 from composing.schema import RunConfig, WorldModelRunConfig, is_race
 from dreamer_racing import parallel
 from dreamer_racing.commands import from_here
@@ -46,7 +53,7 @@ from dreamer_racing.training.directory import PREFIX, RunDirectory, env_steps_of
 from dreamer_racing.training.following import LockHeldByFirst
 from dreamer_racing.training.session import Session
 
-TRAINED_ON = ("track", "task", "decoys", "init_from", *SEEN)
+TRAINED_ON = ("track", "task", "decoys", "init_from", *OBSERVATION_SETTINGS)
 """Settings that a resumed run cannot change."""
 
 
@@ -65,16 +72,18 @@ def launch(
         remedy: what to lower once a loss is not finite, e.g. "ppo.learning_rate".
     """
     start_logging()
-    threading.excepthook = tell_of_thread
+    threading.excepthook = print_thread_error
     torch.set_float32_matmul_precision("high")  # TF32 on CUDA; on a CPU "medium" would be bfloat16 where it has AMX
     try:
         with plain_errors():
-            parallel.join()
+            parallel.init()
             if not parallel.is_first():
                 follow_quietly()
             config, overrides = compose_run(config)
-            if config.resume and parallel.largest(int(is_finished(config))):  # all look before the first tidies up
-                print(what_next(cast(RunConfig, config), RunDirectory(Path(config.run_dir))))
+            if config.resume and parallel.all_reduce_max(
+                int(is_finished(config))
+            ):  # all look before the first tidies up
+                print(next_steps(cast(RunConfig, config), RunDirectory(Path(config.run_dir))))
                 return
             config = resolve(config)
             if config.resume and (changed := changed_settings(config)):
@@ -82,9 +91,9 @@ def launch(
             run = cast(RunConfig, OmegaConf.to_object(config))
         with training_session(run, overrides, remedy) as session:
             train(run, session)
-            print(what_next(run, session.directory))
+            print(next_steps(run, session.directory))
     finally:
-        parallel.leave()
+        parallel.destroy()
 
 
 def compose_run(config: DictConfig) -> tuple[DictConfig, list[str]]:
@@ -133,7 +142,7 @@ def training_session(config: RunConfig, overrides: list[str], remedy: str) -> It
         kept = session.directory.nonfinite_batch.with_suffix(f".{parallel.rank()}.pt" if parallel.rank() else ".pt")
         raise SystemExit(
             f"error: {error} Update {session.counters['updates']:,}, {session.env_steps:,} env_steps. "
-            f"{keep_batch(error, kept)}; {session.last_good}. Continue from there with a lower {remedy}."
+            f"{save_batch(error, kept)}; {session.last_good}. Continue from there with a lower {remedy}."
         ) from error
     except OSError as error:  # failed writes are tolerated during the run, but not at its end
         raise SystemExit(f"error: {error}. The run is not finished: {session.last_good}.") from error
@@ -188,7 +197,7 @@ def make_run_loggers(config: RunConfig, directory: RunDirectory, resumed: int | 
     return loggers
 
 
-def tell_of_thread(failure: threading.ExceptHookArgs) -> None:
+def print_thread_error(failure: threading.ExceptHookArgs) -> None:
     """Print a thread's OSError in one line, since its waiting caller gets it too; other errors with traceback."""
     if isinstance(failure.exc_value, OSError):
         print(f"error in {failure.thread.name if failure.thread else 'a thread'}: {failure.exc_value}", file=sys.stderr)
@@ -196,7 +205,7 @@ def tell_of_thread(failure: threading.ExceptHookArgs) -> None:
         threading.__excepthook__(failure)
 
 
-def keep_batch(error: NonFiniteLossError, path: Path) -> str:
+def save_batch(error: NonFiniteLossError, path: Path) -> str:
     """Save the batch whose loss was not finite; return where it is, or why it could not be saved."""
     try:
         torch.save(error.batch.to("cpu").to_dict(), path)
@@ -239,7 +248,7 @@ def resumed_config(algorithm: str, resume: str, overrides: list[str]) -> tuple[D
     ]
     merged = merge_overrides([*begun_with, as_override("run_dir", run_dir)], overrides)
     config = hydra.compose(algorithm, merged)
-    keep_saved(config, known, {override_key(override) for override in overrides})
+    restore_saved_settings(config, known, {override_key(override) for override in overrides})
     config.track_description = known.track_description  # even if tuned= or budget= is given
     return config, merged
 
@@ -261,7 +270,7 @@ def is_finished(config: DictConfig) -> bool:
     return True
 
 
-def what_next(config: RunConfig, directory: RunDirectory) -> str:
+def next_steps(config: RunConfig, directory: RunDirectory) -> str:
     """Return lines with a finished run's best policy, latest video and latest plot, and commands to use next."""
     left = {"run": directory.path}
     if any(directory.best.checkpoints.glob(f"{PREFIX}-*")):

@@ -18,7 +18,7 @@ NEEDED = (*FOR_HELP, "hydra", "torch", "mujoco")
 ROOT = Path(__file__).resolve().parents[2]
 
 
-def follows() -> bool:
+def is_follower_rank() -> bool:
     """Return whether this is one of several processes that `torchrun` started, but not the first."""
     return int(os.environ.get("WORLD_SIZE") or 1) > 1 and os.environ.get("RANK") != "0"
 
@@ -29,7 +29,7 @@ def say_error(error: object) -> None:
     Of several processes that `torchrun` started, the first prints at once. Its end makes torchrun end the others, which
     wait before they print, so an error that all of them have is printed once.
     """
-    if follows():
+    if is_follower_rank():
         time.sleep(HEAD_START)
     print(f"error: {error}", file=sys.stderr, flush=True)
 

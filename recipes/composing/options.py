@@ -117,7 +117,7 @@ def no_such_choice(group: str, choice: str, choices: Sequence[str]) -> str:
     return f"{group}={choice}: there are {', '.join(choices)}{settings.suggestion(choice, choices)}."
 
 
-def refuse_slips(recipe: str, arguments: Sequence[str]) -> None:
+def check_arguments(recipe: str, arguments: Sequence[str]) -> None:
     """Refuse unknown settings, unknown choices of a group, and settings written as flags."""
     for argument in arguments:
         flag, _, value = argument.partition("=")
@@ -145,7 +145,7 @@ def refuse_slips(recipe: str, arguments: Sequence[str]) -> None:
 WIDTH, COLUMN = 118, 42
 
 
-def answer_early() -> None:
+def handle_help_and_typos() -> None:
     """Print the started recipe's help if asked for, or an error for an unknown setting, and exit; else return."""
     program = Path(sys.argv[0])
     if program.resolve().parent != FOLDER:
@@ -157,7 +157,7 @@ def answer_early() -> None:
             os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         raise SystemExit(0)
     try:
-        refuse_slips(program.stem, sys.argv[1:])
+        check_arguments(program.stem, sys.argv[1:])
     except ValueError as error:
         say_error(error)
         raise SystemExit(2) from error
@@ -171,9 +171,9 @@ def command(recipe: str) -> str:
 
 def usage(recipe: str) -> Iterator[str]:
     """Yield the lines of a recipe's help."""
-    said = ast.get_docstring(ast.parse((FOLDER / f"{recipe}.py").read_text(encoding="utf-8"))) or ""
-    said = re.sub(r"python recipes/(\w+)\.py", lambda match: command(match[1]), said)
-    yield from (f"usage: {command(recipe)} [NAME=VALUE ...]", "", *said.splitlines(), "")
+    docstring = ast.get_docstring(ast.parse((FOLDER / f"{recipe}.py").read_text(encoding="utf-8"))) or ""
+    docstring = re.sub(r"python recipes/(\w+)\.py", lambda match: command(match[1]), docstring)
+    yield from (f"usage: {command(recipe)} [NAME=VALUE ...]", "", *docstring.splitlines(), "")
     if found := groups(recipe):
         yield "Groups: settings that go together (GROUP=CHOICE)"
         for name, choices in found.items():

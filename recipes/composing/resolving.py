@@ -12,10 +12,10 @@ import torch
 from hydra.core.global_hydra import GlobalHydra
 from omegaconf import DictConfig, OmegaConf
 
-from composing.building import describe_file, worlds_device
+from composing.building import serialize_track_file, worlds_device
 from composing.entry import new_run_dir
 from composing.options import CONFIG_DIR
-from composing.saved import said, settings_of
+from composing.saved import format_value, settings_of
 from composing.workers import resolve_workers
 from dreamer_racing import parallel
 from dreamer_racing.devices import choose_device, choose_mixed_precision
@@ -54,7 +54,7 @@ def resolve_common(config: DictConfig, num_envs: int) -> torch.device:
         )
     if config.run_dir is None:
         scene = config.track if config.env.suite == "race" else config.task
-        config.run_dir = parallel.agreed(str(new_run_dir(config.algorithm, scene)))
+        config.run_dir = parallel.broadcast(str(new_run_dir(config.algorithm, scene)))
     return device
 
 
@@ -62,11 +62,11 @@ def note_track(config: DictConfig) -> None:
     """Store a track file's contents in a new run's configuration; in a resumed run, print if the file has changed."""
     if config.track_description is None:
         found: list[str | None] = []
-        parallel.together(lambda: found.append(describe_file(config.track)))
-        config.track_description = parallel.agreed(found[0])
+        parallel.run_in_all(lambda: found.append(serialize_track_file(config.track)))
+        config.track_description = parallel.broadcast(found[0])
         return
     with suppress(TrackError):  # the file is gone or no longer valid
-        if describe_file(config.track) != config.track_description:
+        if serialize_track_file(config.track) != config.track_description:
             print(f"track: as {config.track} was when the run was begun, which it no longer is")
 
 
@@ -117,20 +117,20 @@ def resolve_world_model(config: DictConfig) -> DictConfig:
         print(f"model: {size} (model=auto on {device.type}, budget={config.budget})")
     config.model.size = size
     shorten_windows(config, device)
-    let_drift(config)
+    disable_drift_loss(config)
     resolve_workers(config)
     numbers = OmegaConf.load(CONFIG_DIR / "model" / f"{size}.yaml")
     for name in config.model:
         if OmegaConf.is_missing(config.model, name):
             config.model[name] = numbers[name]
     if config.model.mixed_precision is None:
-        config.model.mixed_precision, reason = parallel.agreed(choose_mixed_precision(device))
+        config.model.mixed_precision, reason = parallel.broadcast(choose_mixed_precision(device))
         print(f"mixed precision: {'on' if config.model.mixed_precision else 'off'}, {reason}")
     if config.model.cuda_graph is None:
-        config.model.cuda_graph = captures(config, device)
+        config.model.cuda_graph = can_capture_graph(config, device)
         if config.model.cuda_graph:
             print("updates: replayed as one CUDA graph (model.cuda_graph=null)")
-    tell_of_tuned(config)
+    print_tuned(config)
     if config.replay.held_out is None:
         worlds = config.env.num_envs // parallel.asked_for()  # those of the first process, which holds them out
         config.replay.held_out = int(worlds >= FEW_WORLDS)
@@ -139,7 +139,7 @@ def resolve_world_model(config: DictConfig) -> DictConfig:
     return config
 
 
-def tell_of_tuned(config: DictConfig) -> None:
+def print_tuned(config: DictConfig) -> None:
     """Print what the chosen settings of the group `tuned` mean, and which of them have other values here."""
     if config.tuned not in ("auto", "none") and (CONFIG_DIR / "tuned" / f"{config.tuned}.yaml").is_file():
         files = [CONFIG_DIR / "tuned" / folder / f"{config.tuned}.yaml" for folder in ("", config.algorithm)]
@@ -168,7 +168,7 @@ def changed_from_tuned(config: DictConfig) -> list[str]:
         plain = settings_of(hydra.compose(config.algorithm, ["tuned=none", f"model={tuned['model.size']}"]))
     here = settings_of(config)
     return [
-        f"{name}={said(here[name])} ({said(value)})"
+        f"{name}={format_value(here[name])} ({format_value(value)})"
         for name, value in tuned.items()
         if value not in (plain[name], here[name]) and name != "tuned"
     ]
@@ -193,7 +193,7 @@ def shorten_windows(config: DictConfig, device: torch.device) -> None:
         config.replay.context = shortened
 
 
-def let_drift(config: DictConfig) -> None:
+def disable_drift_loss(config: DictConfig) -> None:
     """Turn the policy-drift loss off if the replay stores no latents, or if latents are sampled."""
     reasons = {
         "records keep no latents (replay.context=false)": not config.replay.context,
@@ -204,6 +204,6 @@ def let_drift(config: DictConfig) -> None:
         print(f"policy's drift: not held, because {' and '.join(name for name, holds in reasons.items() if holds)}")
 
 
-def captures(config: DictConfig, device: torch.device) -> bool:
+def can_capture_graph(config: DictConfig, device: torch.device) -> bool:
     """Return whether updates can be captured as a CUDA graph: not if processes exchange data in its middle."""
     return device.type == "cuda" and (parallel.asked_for() == 1 or config.algorithm == "latent_ppo")

@@ -9,7 +9,7 @@ from typing import Any, cast
 import torch
 from omegaconf import MISSING
 
-from composing.building import Environment, describe_file, make_env, make_learner, worlds_device
+from composing.building import Environment, make_env, make_learner, serialize_track_file, worlds_device
 from composing.saved import trained_config
 from composing.schema import RunConfig, WorldModelRunConfig, is_race
 from dreamer_racing.devices import choose_device
@@ -76,7 +76,7 @@ class Restored:
     def weights_sha256(self) -> str | None:
         """SHA-256 of the weights that act, as in an export's contract; None for the baselines."""
         if isinstance(self.flyer, WorldModelLearner):
-            return hash_weights(ActorStep(self.flyer.flying_agent))
+            return hash_weights(ActorStep(self.flyer.evaluation_agent))
         return hash_weights(ActorStep(self.flyer.agent)) if isinstance(self.flyer, ShippedAgent) else None
 
     def provenance(self, config: FlightConfig) -> dict[str, Any]:
@@ -90,7 +90,7 @@ class Restored:
             "env_steps": self.env_steps,
             "trained_on": self.trained_on,
             "track": self.trained.track,
-            "track_sha256": hash_track(self.trained.track_as_begun()),
+            "track_sha256": hash_track(self.trained.saved_track()),
             "decoys": self.trained.decoys,
             "preset": self.trained.env.preset,
             "control_rate": self.trained.env.control_rate,
@@ -122,7 +122,7 @@ def restore(config: FlightConfig) -> Restored:
     trained_on = trained.track
     if config.track:
         trained.track, trained.track_description, trained.decoys = config.track, None, None
-    trained.track_description = trained.track_description or describe_file(trained.track)  # as the file is now
+    trained.track_description = trained.track_description or serialize_track_file(trained.track)  # as the file is now
     trained.decoys = config.decoys or trained.decoys
     trained.env.preset = config.preset or trained.env.preset
     trained.env.renderer = config.renderer
@@ -174,7 +174,7 @@ def results_of(checkpoint: Path) -> Path:
     return Path("runs") / f"agent_{checkpoint.name}" if is_agent(checkpoint) else RunDirectory.of(checkpoint).path
 
 
-def heading(title: str, provenance: dict[str, Any]) -> str:
+def report_heading(title: str, provenance: dict[str, Any]) -> str:
     """Return the head of a Markdown report: the title, the command, and where the numbers come from."""
     facts = {name: value for name, value in provenance.items() if name != "command" and value is not None}
     text = "; ".join(f"{name.replace('_', ' ')} {value}" for name, value in facts.items())

@@ -13,7 +13,7 @@ from dreamer_racing.figures.runs import flatten
 from dreamer_racing.settings import shortened
 from dreamer_racing.training.directory import RunDirectory
 
-OF_THIS_MACHINE = (
+MACHINE_SETTINGS = (
     "device",
     "env.renderer",
     "model.mixed_precision",
@@ -22,7 +22,7 @@ OF_THIS_MACHINE = (
     "run_dir",
 )
 """Settings that a resumed run chooses anew, unless they were given when it began."""
-SEEN = ("env.control_rate", "env.camera_rate", "env.camera_tilt", "env.imu", "env.vector")
+OBSERVATION_SETTINGS = ("env.control_rate", "env.camera_rate", "env.camera_tilt", "env.imu", "env.vector")
 """Settings that define an agent's observations and their rate; its networks fit no others."""
 
 Config = TypeVar("Config", DictConfig, ListConfig)
@@ -69,13 +69,13 @@ def read_yaml(path: Path, kind: type[Config]) -> Config:
     if isinstance(content, DictConfig):
         for name, value in flatten(cast(dict[str, Any], OmegaConf.to_container(content, resolve=False))):
             if "${" in str(value):
-                said = shortened(f"{name}: {value}")
-                raise ValueError(f"{path}: {said}. A saved configuration says values, it refers to none.")
+                shown = shortened(f"{name}: {value}")
+                raise ValueError(f"{path}: {shown}. A saved configuration says values, it refers to none.")
     return content
 
 
-def keep_saved(config: DictConfig, saved: DictConfig, given: Collection[str]) -> None:
-    """Set a composed configuration to the saved values, except `OF_THIS_MACHINE` and settings that are given now.
+def restore_saved_settings(config: DictConfig, saved: DictConfig, given: Collection[str]) -> None:
+    """Set a composed configuration to the saved values, except `MACHINE_SETTINGS` and settings that are given now.
 
     So a resumed run keeps its settings, even if a later version has other defaults.
 
@@ -87,7 +87,7 @@ def keep_saved(config: DictConfig, saved: DictConfig, given: Collection[str]) ->
     if {"tuned", "budget"}.isdisjoint(given):
         for name, value in flatten(cast(dict[str, Any], OmegaConf.to_container(saved))):
             is_given = any(name == other or name.startswith(f"{other}.") for other in given)
-            if not is_given and name not in OF_THIS_MACHINE:
+            if not is_given and name not in MACHINE_SETTINGS:
                 OmegaConf.update(config, name, value)
 
 
@@ -96,7 +96,7 @@ def settings_of(config: DictConfig) -> dict[str, Any]:
     return dict(flatten(cast(dict[str, Any], OmegaConf.to_container(config, enum_to_str=True))))
 
 
-def said(value: Any) -> str:
+def format_value(value: Any) -> str:
     """Return a value of `settings_of` as it is written on the command line."""
     return "null" if value is None else str(value).lower() if isinstance(value, bool) else str(value)
 
@@ -105,7 +105,7 @@ def changed_settings(config: DictConfig) -> list[str]:
     """Return the settings that a resumed run has changed: by an override, this machine, or another version."""
     before = settings_of(saved_config(Path(config.run_dir)))
     return [
-        f"{name}={said(value)} (was {said(before.get(name))})"
+        f"{name}={format_value(value)} (was {format_value(before.get(name))})"
         for name, value in settings_of(config).items()
         if value != before.get(name) and name not in ("resume", "run_dir", "track_description")
     ]

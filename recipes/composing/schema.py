@@ -83,7 +83,7 @@ class RunConfig:
     many_processes: ClassVar[bool] = False  # whether torchrun may start several that train together
 
     @property
-    def moves_start_on_line(self) -> bool:
+    def schedules_start_on_line(self) -> bool:
         """Whether the share of episodes that begin on a line changes in the run."""
         return False
 
@@ -93,7 +93,7 @@ class RunConfig:
         assert self.run_dir is not None, "resolve_common() names it"
         return RunDirectory(Path(self.run_dir))
 
-    def track_as_begun(self) -> Track:
+    def saved_track(self) -> Track:
         """Return the track; that of a file is as it was when the run began, even if the file has changed."""
         noted = self.track_description
         track = self.track if noted is None else read_track(json.loads(noted), f"track_description of {self.track}")
@@ -125,13 +125,13 @@ class RunConfig:
                     f"evaluation.start_noise={noise} is for races, and env.suite={env.suite}: leave it at 0."
                 )
             return
-        track = self.track_as_begun()
+        track = self.saved_track()
         env.check_race(track)
         try:
             StartSampler(track, start_noise=noise)
         except ValueError as error:
             raise ValueError(f"evaluation.{error}") from error
-        if env.start_on_line == 1 and env.start_beyond_gate and not self.moves_start_on_line:
+        if env.start_on_line == 1 and env.start_beyond_gate and not self.schedules_start_on_line:
             raise ValueError(
                 f"env.start_beyond_gate={env.start_beyond_gate:g} is a share of the episodes that do not begin on a "
                 "line, and env.start_on_line=1 leaves none of them: lower that, or leave the other out."
@@ -192,7 +192,7 @@ class WorldModelRunConfig(ReplayRunConfig):
     many_processes: ClassVar[bool] = True
 
     @property
-    def moves_start_on_line(self) -> bool:
+    def schedules_start_on_line(self) -> bool:
         """Whether the schedule moves the share of episodes that begin on a line."""
         return self.schedule.start_on_line.to is not None
 

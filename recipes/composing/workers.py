@@ -23,8 +23,8 @@ from dreamer_racing.learners.update import WorldModelLearner
 from dreamer_racing.modules import DreamerPolicy, Interface
 
 DIVIDED = ("env.num_envs", "model.batch_size", "model.imagination_starts")
-OF_PPO = ("loss.ppo.steps", "loss.ppo.minibatch")
-"""Settings that are divided equally among the processes; `OF_PPO` in latent PPO only."""
+DIVIDED_PPO = ("loss.ppo.steps", "loss.ppo.minibatch")
+"""Settings that are divided equally among the processes; `DIVIDED_PPO` in latent PPO only."""
 ROUNDED_DOWN = ("replay.capacity", "replay.recent_records")
 """Settings that are divided too, but may leave a remainder."""
 SEEDS_APART = 1_000_000
@@ -37,7 +37,7 @@ def share_of(config: WorldModelRunConfig) -> WorldModelRunConfig:
     Raises:
         ValueError: a setting cannot be divided equally, or there are too few devices.
     """
-    processes = parallel.count()
+    processes = parallel.num_processes()
     if processes == 1:
         return config
     check_devices(config)
@@ -47,7 +47,7 @@ def share_of(config: WorldModelRunConfig) -> WorldModelRunConfig:
             "in the midst of an update. Set it to false, or use recipes/latent_ppo.py, which imagines nothing."
         )
     shared = OmegaConf.structured(config)
-    for name in DIVIDED + (OF_PPO if isinstance(config, LatentPPORunConfig) else ()) + ROUNDED_DOWN:
+    for name in DIVIDED + (DIVIDED_PPO if isinstance(config, LatentPPORunConfig) else ()) + ROUNDED_DOWN:
         whole = OmegaConf.select(shared, name)
         if whole is None:
             continue
@@ -75,14 +75,14 @@ def share_of(config: WorldModelRunConfig) -> WorldModelRunConfig:
 
 def check_devices(config: WorldModelRunConfig) -> None:
     """Refuse more processes than this machine has CUDA devices, and the same device for all of them."""
-    here, there = parallel.count_here(), torch.cuda.device_count()
+    here, there = parallel.num_local_processes(), torch.cuda.device_count()
     for name, device in (("device", config.device), ("env.device", config.env.device)):
         if not device.startswith("cuda"):
             continue
         if ":" in device:
             raise ValueError(
-                f"{name}={device} would have all {parallel.count()} processes on one device: with {name}=cuda each has "
-                "its own; CUDA_VISIBLE_DEVICES chooses which."
+                f"{name}={device} would have all {parallel.num_processes()} processes on one device: with {name}=cuda "
+                "each has its own; CUDA_VISIBLE_DEVICES chooses which."
             )
         if here > there:
             raise ValueError(
@@ -97,7 +97,7 @@ def _own_device(device: str) -> str:
 
 
 NUM_WORKERS = 2
-OF_RACES = ("body_rate_weight", "worlds.start_on_line")
+SYNCED_RACE_ATTRIBUTES = ("body_rate_weight", "worlds.start_on_line")
 """Attributes of a race's environment that the curriculum and a schedule change during the run."""
 
 
@@ -157,7 +157,7 @@ def make_workers(config: WorldModelRunConfig, env: Environment, policy: DreamerP
         collector,
         policy,
         env,
-        OF_RACES if is_race(config) else (),
+        SYNCED_RACE_ATTRIBUTES if is_race(config) else (),
         weight_interval=config.weight_interval,
         patience=asked.patience,
         leaves=joined,

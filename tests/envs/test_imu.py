@@ -43,20 +43,20 @@ def act(*action: float) -> Tensor:
 
 def test_a_hover_weighs_its_weight() -> None:
     simulator = simulated(PRESETS["easy"])
-    assert simulator.feel().tolist() == [[0, 0, 0, 0, 0, GRAVITY]]
+    assert simulator.ideal_imu().tolist() == [[0, 0, 0, 0, 0, GRAVITY]]
     for _ in range(20):
         simulator.step(act(PRESETS["easy"].hover_action, 0.0, 0.0, 0.0))
-    assert torch.allclose(simulator.feel(), act(0, 0, 0, 0, 0, GRAVITY), atol=1e-3)
+    assert torch.allclose(simulator.ideal_imu(), act(0, 0, 0, 0, 0, GRAVITY), atol=1e-3)
 
 
 def test_a_fall_weighs_nothing_and_full_thrust_what_the_rotors_give() -> None:
     simulator = simulated(PRESETS["easy"], attitude=(0.6, 0.0, 0.8, 0.0))
     for _ in range(60):
         simulator.step(act(-1.0, 0.0, 0.0, 0.0))
-    assert simulator.feel().abs().max() < 0.01
+    assert simulator.ideal_imu().abs().max() < 0.01
     for _ in range(60):
         simulator.step(act(1.0, 0.0, 0.0, 0.0))
-    assert torch.allclose(simulator.feel()[:, 3:], act(0, 0, 4 * 4.0 / 0.6), atol=0.01)
+    assert torch.allclose(simulator.ideal_imu()[:, 3:], act(0, 0, 4 * 4.0 / 0.6), atol=0.01)
 
 
 def test_drag_is_felt_against_the_way_and_rates_are_the_bodys() -> None:
@@ -66,11 +66,11 @@ def test_drag_is_felt_against_the_way_and_rates_are_the_bodys() -> None:
     simulator.step(act(drone.hover_action, 0.0, 0.0, 0.0))
     velocity = simulator.state.linear_velocity
     expected = -velocity * torch.tensor(parameters.drag) / drone.mass
-    assert torch.allclose(simulator.feel()[:, 3:5], expected[:, :2], atol=0.01)
+    assert torch.allclose(simulator.ideal_imu()[:, 3:5], expected[:, :2], atol=0.01)
     for _ in range(20):
         simulator.step(act(0.0, 0.3, -0.2, 0.5))
-    assert torch.equal(simulator.feel()[:, :3], simulator.state.body_rates)
-    assert torch.allclose(simulator.feel()[:, :3], act(3.0, -2.0, 2.0), atol=0.1)
+    assert torch.equal(simulator.ideal_imu()[:, :3], simulator.state.body_rates)
+    assert torch.allclose(simulator.ideal_imu()[:, :3], act(3.0, -2.0, 2.0), atol=0.1)
 
 
 def test_the_plant_feels_the_same() -> None:

@@ -17,7 +17,7 @@ from torch import Tensor
 from torchrl.envs.utils import check_env_specs
 
 from dreamer_racing.envs import Camera, DroneRacingEnv, RaceWorlds, load
-from dreamer_racing.envs.own import OwnFunction, RaceState, Transition
+from dreamer_racing.envs.own import CustomFunction, RaceState, Transition
 from dreamer_racing.modules import Interface
 
 PAGE = (Path(__file__).parents[2] / "docs" / "own_rewards.md").read_text(encoding="utf-8")
@@ -184,7 +184,7 @@ def test_bad_ones_are_refused(own: dict[str, Any], message: str) -> None:
 
 
 def test_a_gpu_is_asked_only_where_it_waits_anyway() -> None:
-    own = OwnFunction("reward", lambda step: step, 2, torch.device("cpu"))
+    own = CustomFunction("reward", lambda step: step, 2, torch.device("cpu"))
     own.check()
     own._broken.fill_(True)
     with pytest.raises(ValueError, match="returned numbers that are not finite"):

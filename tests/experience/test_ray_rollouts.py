@@ -304,15 +304,15 @@ def test_workers_fly_what_a_single_process_would(flown: Flown, monkeypatch: pyte
     with torch.random.fork_rng():
         survivor = twin(0)
         for number, request in enumerate(asked):
-            flight = survivor.fly(request)
+            flight = survivor.collect_rollout(request)
             assert_same(flown.rounds[number][:worlds], unpack_rollout(flight.rollout))
-            assert survivor.fly(request) is flight, "asked again, it does not fly on"
+            assert survivor.collect_rollout(request) is flight, "asked again, it does not fly on"
         lost = twin(1)
         for number, request in enumerate(asked[: flown.lost_in]):
-            assert_same(flown.rounds[number][worlds:], unpack_rollout(lost.fly(request).rollout))
+            assert_same(flown.rounds[number][worlds:], unpack_rollout(lost.collect_rollout(request).rollout))
         successor = twin(1)
         for number, request in enumerate(asked[flown.lost_in :], flown.lost_in):
-            assert_same(flown.rounds[number][worlds:], unpack_rollout(successor.fly(request).rollout))
+            assert_same(flown.rounds[number][worlds:], unpack_rollout(successor.collect_rollout(request).rollout))
 
 
 @pytest.mark.slow
@@ -369,7 +369,7 @@ def test_an_error_in_flight_is_told_and_ends_the_rounds(flown: Flown) -> None:
     """And is no loss, after which Ray would ask again."""
     assert flown.rollouts.drain() is not None
     wrong = Request(ROUNDS + len(AGES_LATER) + 1, [], 0, {"nowhere.at_all": 1})
-    flown.rollouts._asked = [worker.fly.remote(wrong) for worker in flown.rollouts._workers]
+    flown.rollouts._asked = [worker.collect_rollout.remote(wrong) for worker in flown.rollouts._workers]
     with pytest.raises(WorkerError, match=r"Worker 0 failed \(AttributeError: .*nowhere.*\)\."):
         flown.rollouts.drain()
     assert flown.rollouts.drain() is None and next(flown.rollouts, None) is None
@@ -392,7 +392,7 @@ def test_who_does_not_answer_is_waited_for_with_patience_and_shortly_by_a_run_th
 
     with pytest.raises(WorkerError, match=r"Of 1 workers, 0 did not answer .*workers\.patience=1\.5.*num_workers="):
         next(waiting())
-    monkeypatch.setattr("dreamer_racing.experience.ray_rollouts.FAREWELL", 0.5)
+    monkeypatch.setattr("dreamer_racing.experience.ray_rollouts.STOP_TIMEOUT", 0.5)
     stopped = waiting()
     stopped.stopping = lambda: True
     assert next(stopped, None) is None and stopped.drain() is None

@@ -117,7 +117,7 @@ def test_every_copy_flies_as_the_policy_did(flown, latent: str, parts: bool, tmp
     assert [channel["unit"] for channel in written["imu"]["channels"]] == ["rad/s"] * 3 + ["m/s^2"] * 3
     assert written["imu"]["trained_errors"] == vars(IMUS["noisy"])
     actor = OnnxActor(tmp_path / "actor.onnx", seed=0)
-    assert actor.feels and actor.in_parts is parts
+    assert actor.needs_imu and actor.in_parts is parts
     image, sample = flight.observations[0], flight.imu[0]
     first = actor.step(image, imu=sample)
     actor.reset()

@@ -98,7 +98,7 @@ def test_the_averaged_weights_fly_where_they_are_kept(tmp_path: Path) -> None:
         agent, metadata = load_agent(tmp_path, Interface(), weights)
         hashes[weights] = hash_weights(ActorStep(agent))
         assert metadata["weights"] == ("averaged" if weights == "auto" else weights)
-    assert hashes["auto"] == hashes["averaged"] == hash_weights(ActorStep(learner.flying_agent))
+    assert hashes["auto"] == hashes["averaged"] == hash_weights(ActorStep(learner.evaluation_agent))
     assert hashes["trained"] == hash_weights(ActorStep(learner.agent)) != hashes["averaged"]
 
 
@@ -186,7 +186,7 @@ def described(contract: dict, **camera: object) -> SimpleNamespace:
     """What `check_env` looks at of an environment that is as a contract describes it, but for its camera."""
     parameters = SimpleNamespace(control_dt=1.0 / contract["control"]["rate_hz"])
     worlds = SimpleNamespace(
-        parameters=parameters, camera=replace(Camera(32, 32, tilt=30.0), **camera), imu=None, own_vector=None
+        parameters=parameters, camera=replace(Camera(32, 32, tilt=30.0), **camera), imu=None, custom_vector=None
     )
     return SimpleNamespace(from_pixels=True, worlds=worlds)
 

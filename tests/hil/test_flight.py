@@ -22,14 +22,14 @@ from dreamer_racing.hil.battery import BatteryConfig, Reading
 from dreamer_racing.hil.camera import NoseCamera
 from dreamer_racing.hil.chain import LIFT, ChainConfig, FlightChain, Inputs, describe_outputs, read_inputs
 from dreamer_racing.hil.flyer import ActorFlyer, Flyer
-from dreamer_racing.hil.loop import ENDING, FAREWELL
+from dreamer_racing.hil.loop import DISARM_SECONDS, ENDING
 from dreamer_racing.hil.operator import Operator
 from dreamer_racing.hil.pose import PosePacket, Received, decode_pose
 from dreamer_racing.hil.recording import FILE, Flight, FlightRecorder
 from dreamer_racing.hil.safety import SafetyLimits, State
 from dreamer_racing.hil.vehicle import Command, Pose, Setpoint, hover
 from dreamer_racing.plant.delivery import Delivery
-from dreamer_racing.plant.lock_step import BEGAN, LockStep, make_chain
+from dreamer_racing.plant.lock_step import CLOCK_OFFSET, LockStep, make_chain
 from dreamer_racing.plant.pilot import PilotFlyer
 from dreamer_racing.plant.vehicle import Mismatch, PlantVehicle
 
@@ -149,7 +149,7 @@ def test_the_battery_is_heard_in_flight_reckoned_with_and_played_back(tmp_path):
         def listen(self):
             return [Reading(self.now(), 3.9 if 1.0 < self.elapsed < 1.03 else 16.0 - 0.5 * self.elapsed)]
 
-        def reckon_with(self, voltage):
+        def set_voltage(self, voltage):
             self.reckoned.append(voltage)
 
     def chain():
@@ -271,7 +271,7 @@ def test_a_signal_ends_the_flight_with_a_second_of_disarm_frames(number):
     assert fly_hovering(plant) == number.name
     frames = [(moment, command) for moment, command in plant.sent if moment > sent[0] + 0.03]
     assert not any(command.armed for _, command in frames)
-    assert frames[-1][0] - frames[0][0] == pytest.approx(FAREWELL, abs=0.05)
+    assert frames[-1][0] - frames[0][0] == pytest.approx(DISARM_SECONDS, abs=0.05)
 
 
 def test_an_actor_that_hangs_is_disarmed_meanwhile_and_for_good():
@@ -308,7 +308,7 @@ def test_an_actor_that_hangs_is_disarmed_meanwhile_and_for_good():
 def test_whatever_breaks_the_vehicle_is_disarmed():
     class Broken(Hover):
         def act(self, pose, image, target_gate):
-            if pose.time > BEGAN + 1.5:
+            if pose.time > CLOCK_OFFSET + 1.5:
                 raise RuntimeError("out of order")
             return hover()
 
@@ -326,7 +326,7 @@ def test_a_terminal_that_is_stopped_does_not_keep_disarm_frames_back():
     class Stopped(logging.Handler):
         def emit(self, record):
             deadline = time.monotonic() + 3
-            while (not plant.sent or plant.sent[-1][0] < 2.45) and time.monotonic() < deadline:  # 1.5 s and FAREWELL
+            while (not plant.sent or plant.sent[-1][0] < 2.45) and time.monotonic() < deadline:  # + DISARM_SECONDS
                 time.sleep(0.001)
             waited.append((record.getMessage(), time.monotonic() < deadline))
 
@@ -369,7 +369,7 @@ def test_messages_that_are_no_poses_are_said_where_there_is_none(caplog):
 def test_a_disk_that_is_full_does_not_end_a_flight():
     class Full:
         def tick(self, time, message):
-            if time > BEGAN + 1.0:
+            if time > CLOCK_OFFSET + 1.0:
                 raise OSError(28, "No space left on device")
 
     plant = Watched(CIRCLE)
@@ -486,7 +486,9 @@ def test_until_it_moves_a_vehicle_is_lifted_and_its_flyer_begun_anew(lift):
     thrusts = [setpoint.collective_thrust / GRAVITY for _, setpoint in armed[2:turning]]
     assert len(thrusts) > 10 and thrusts == sorted(thrusts) and thrusts[0] < 1.01 and 1.1 < thrusts[-1] < 1.2
     began = armed[turning][0]
-    assert flyer.began.time == pytest.approx(BEGAN + began, abs=0.001), "its first choice is the first that is sent"
+    assert flyer.began.time == pytest.approx(CLOCK_OFFSET + began, abs=0.001), (
+        "its first choice is the first that is sent"
+    )
     assert 0.2 < flyer.began.linear_velocity[2] < 0.4
 
 

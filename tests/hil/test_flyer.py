@@ -87,7 +87,7 @@ def test_what_safety_would_clip_is_refused_unless_it_is_meant():
         check_ranges(contract, limits)
     with pytest.raises(ValueError, match=r"limits.thrust_max=30 clips the actor, which asks for up to 42.\d+ m/s²"):
         check_ranges(contract, replace(limits, rate_max=(16.0, 16.0, 6.4)))
-    said = check_ranges(contract, limits, meant=("rate_max", "thrust_max"))
+    said = check_ranges(contract, limits, user_limits=("rate_max", "thrust_max"))
     assert [words.partition("=")[0] for words in said] == ["limits.rate_max", "limits.thrust_max"]
 
 
@@ -294,7 +294,7 @@ def test_sticks_have_names():
 class Feeling:
     """Damps by the gyro, so that every sample shows in what it wants."""
 
-    rate, camera, feels = 50.0, None, True
+    rate, camera, needs_imu = 50.0, None, True
     told: ClassVar[list[np.ndarray]] = []
 
     def reset(self) -> None:
@@ -317,13 +317,13 @@ def make(**limits: float) -> tuple[LockStep, FlightChain]:
 
 def test_a_flight_is_told_what_the_plant_feels_and_plays_back_bit_for_bit(tmp_path) -> None:
     plant, chain = make()
-    felt, feel = [], plant.plant.vehicle.feel
-    plant.plant.vehicle.feel = lambda: felt.append(feel()) or felt[-1]
+    samples, read_imu = [], plant.plant.vehicle.read_imu
+    plant.plant.vehicle.read_imu = lambda: samples.append(read_imu()) or samples[-1]
     with FlightRecorder(tmp_path / FILE, {}) as recorder:
         plant.fly(chain, 50.0, 2.5, recorder)
     told = np.stack(Feeling.told)
     assert len(told) > 30
-    assert np.array_equal(told, felt[-len(told) :])
+    assert np.array_equal(told, samples[-len(told) :])
     assert np.abs(told[-1, :3] - 0.15).max() < 0.05, "half of 0.3 rad/s, as it damps itself"
     assert told[-1, 5] == pytest.approx(GRAVITY + 0.5, abs=0.1)
     again = make()[1]
@@ -335,17 +335,17 @@ def test_a_flight_is_told_what_the_plant_feels_and_plays_back_bit_for_bit(tmp_pa
 
 def test_without_samples_it_does_not_arm_and_in_flight_it_is_cut() -> None:
     plant, chain = make()
-    plant.feel = list
+    plant.read_imu = list
     assert "it flies by the IMU, and nothing was heard of that" in plant.fly(chain, 50.0, 1.0)
     plant, chain = make()
-    feel = plant.feel
-    plant.feel = lambda: feel() if plant.elapsed < 2.0 else []
+    read_imu = plant.read_imu
+    plant.read_imu = lambda: read_imu() if plant.elapsed < 2.0 else []
     assert plant.fly(chain, 50.0, 5.0).startswith("cut: the actor has given no usable setpoint for 0.1")
     assert 2.0 < plant.elapsed - 1.0 < 2.3, "s, and a second of farewell"
 
 
 def test_an_accelerometer_of_another_scale_is_refused_on_the_ground() -> None:
     plant, chain = make()
-    feel = plant.plant.vehicle.feel
-    plant.plant.vehicle.feel = lambda: feel() * np.array((1.0, 1.0, 1.0, 0.5, 0.5, 0.5))
+    read_imu = plant.plant.vehicle.read_imu
+    plant.plant.vehicle.read_imu = lambda: read_imu() * np.array((1.0, 1.0, 1.0, 0.5, 0.5, 0.5))
     assert "its accelerometer shows 4.91 m/s² where it stands" in plant.fly(chain, 50.0, 1.0)

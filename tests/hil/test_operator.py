@@ -23,7 +23,7 @@ from dreamer_racing.hil.operator import (
     UdpOperator,
     decode_operator,
     encode_operator,
-    send_will,
+    send_operator,
 )
 from dreamer_racing.hil.pose_sources import POSE_SOURCES
 from dreamer_racing.hil.safety import Reason, State
@@ -171,7 +171,7 @@ def test_the_switch_of_a_terminal_is_heard_and_ends_with_a_kill(last, clock, swi
         heard.append(switch.poll())
 
     with caplog.at_level("INFO", "dreamer_racing.hil.operator"):
-        send_will(
+        send_operator(
             Will(Operator(False, False), Operator(True, False), Operator(True, False), last), send, lambda _: None
         )
     assert heard[:2] == [Operator(False, False), Operator(True, False)]
@@ -190,14 +190,14 @@ def test_a_kill_waits_for_a_network_that_is_gone(switch):
             raise OSError("Network is unreachable")
         switch.say(data)
 
-    send_will(Will(Operator(False, True)), send, lambda _: None)
+    send_operator(Will(Operator(False, True)), send, lambda _: None)
     assert switch.poll().kill and next(tries) == 50 + KILLS
 
 
 def test_a_switch_that_is_begun_anew_is_not_taken_for_a_replayed_one(switch, monkeypatch):
     for now in (1.8e9, 1.8e9 + 5.0):
         monkeypatch.setattr("dreamer_racing.hil.operator.time.time", lambda now=now: now)
-        send_will(Will(Operator(True, False), Operator(False, True)), switch.say, lambda _: None)
+        send_operator(Will(Operator(True, False), Operator(False, True)), switch.say, lambda _: None)
     switch.poll()
     assert switch.rejected == 0
 

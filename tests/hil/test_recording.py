@@ -88,7 +88,7 @@ def test_a_full_disk_is_said_by_the_next_tick_or_else_at_the_end(tmp_path, monke
     recorder.tick(0.0, {})
     if noticed:
         deadline = time.monotonic() + 10
-        while recorder._aside.error is None and time.monotonic() < deadline:
+        while recorder._worker.error is None and time.monotonic() < deadline:
             time.sleep(0.01)
         with pytest.raises(OSError, match="No space left"):
             recorder.tick(0.1, {})

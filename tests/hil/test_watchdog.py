@@ -42,7 +42,7 @@ class Wire:
     def listen(self):
         return []
 
-    def reckon_with(self, voltage: float) -> None:
+    def set_voltage(self, voltage: float) -> None:
         pass
 
     def close(self) -> None:
@@ -209,7 +209,7 @@ def test_a_frame_of_the_flight_controller_changes_the_throttle_by_the_thrust_law
     before = throttle(link)
     readings = link.listen()
     assert readings == [Reading(5.0, 14.4)]
-    link.reckon_with(Battery(CONFIG).update(5.0, readings))
+    link.set_voltage(Battery(CONFIG).update(5.0, readings))
     assert motor(throttle(link)) / motor(before) == pytest.approx(16 / 14.4, rel=2e-3)  # in whole ticks
     assert link.listen() == [] and link.rejected == 0
 
@@ -220,12 +220,12 @@ def test_no_reading_in_flight_raises(voltage, mass):
     """The reference is 15 V: from 7.5 V, or what just lifts the drone, to 22.5 V."""
     thrust = ThrustMap(mass=mass, full_thrust=16.0, reference_voltage=15.0, voltage=16.0)
     link = ChannelLink(Transport(), encode_crsf, RateMap(roll=10.0, pitch=10.0, yaw=4.0), thrust)
-    link.reckon_with(voltage)
+    link.set_voltage(voltage)
     link.thrust.check()
     lifting = 15.0 * math.sqrt(9.81 * mass / 16.0)
     expected = min(max(voltage, 7.5, lifting), 22.5) if math.isfinite(voltage) else 16.0
     assert link.thrust.voltage == pytest.approx(expected, rel=1e-4)
-    link.reckon_with(16.0)
+    link.set_voltage(16.0)
     assert link.thrust == thrust
 
 

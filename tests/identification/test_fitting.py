@@ -149,7 +149,7 @@ def recorded(seconds: float, amplitude: float = 2.0) -> Recorded:
 
 def test_a_recording_that_tells_enough_passes() -> None:
     recorded(5.0).check("this one")
-    assert recorded(5.0).moved() == (5.0, 5.0, 5.0, 5.0)
+    assert recorded(5.0).excited_seconds() == (5.0, 5.0, 5.0, 5.0)
 
 
 def test_what_is_too_short_or_too_quiet_says_which_axis_needs_what() -> None:

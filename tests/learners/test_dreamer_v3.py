@@ -544,8 +544,8 @@ def test_weights_are_taken_over_whatever_the_algorithm(first, second):
     saved, learner = made(first, 0), made(second, 1)
     begins, is_left = ([] if kind == "imagined" else [f"{kind}_critic"] for kind in (second, first))
     unmatched = learner.adopt(copy.deepcopy(saved.state_dict()))
-    assert unmatched.anew == ([] if first == second else begins)
-    assert unmatched.left == ([] if first == second else is_left)
+    assert unmatched.initial == ([] if first == second else begins)
+    assert unmatched.unused == ([] if first == second else is_left)
     flew = dict(saved.agent.named_parameters())
     assert all(torch.equal(value, flew[name]) for name, value in learner.agent.named_parameters())
 

@@ -246,7 +246,7 @@ def test_what_was_just_flown_has_not_drifted():
         own = own[own["order"].argsort()]
         for start in range(len(own) - 1):
             window = own[start:].unsqueeze(0)
-            before, after, same = learner.then_and_now(latents_of(learner, window), window)
+            before, after, same = learner.stored_and_current_features(latents_of(learner, window), window)
             followed.append(same.flatten())
             torch.testing.assert_close(before[same.squeeze(-1)], after[same.squeeze(-1)], atol=2e-3, rtol=0)
     assert torch.cat(followed).any() and not torch.cat(followed).all()

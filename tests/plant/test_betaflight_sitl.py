@@ -20,7 +20,7 @@ from dreamer_racing.hil.links.sitl import encode_sitl
 from dreamer_racing.hil.safety_limits import SafetyLimits
 from dreamer_racing.hil.sticks import ThrustMap
 from dreamer_racing.hil.vehicle import Command, Pose
-from dreamer_racing.plant.betaflight_sitl import DIALECTS, BetaflightSitl, decode_motors, dialect_of, encode_state
+from dreamer_racing.plant.betaflight_sitl import CONVENTIONS, BetaflightSitl, convention_of, decode_motors, encode_state
 from dreamer_racing.plant.delivery import Delivery
 from dreamer_racing.plant.lock_step import LockStep, make_chain
 from dreamer_racing.plant.pilot import PilotFlyer
@@ -64,22 +64,22 @@ def test_the_state_packet_is_as_the_firmware_reads_it(version: str, sign: float)
         np.array((4.0, 5.0, 6.0)),
         np.array((0.1, 0.2, 0.3)),
     )
-    data = encode_state(pose, np.array((0.5, -0.6, 9.81)), DIALECTS[version])
+    data = encode_state(pose, np.array((0.5, -0.6, 9.81)), CONVENTIONS[version])
     assert len(data) == 144
     numbers = struct.unpack("<18d", data)
     assert numbers[1:4] == pytest.approx((0.1, -0.2, sign * 0.3))
     assert numbers[4:7] == pytest.approx((-0.5, 0.6, -9.81))
     assert numbers[7:17] == pytest.approx((0.8, 0.0, 0.6, 0.0, 4.0, 5.0, 6.0, 1.0, 2.0, 3.0))
     assert 101325.0 - numbers[17] == pytest.approx(12.0 * 3.0, rel=0.01)  # Pa: 12 a metre near the ground
-    later = encode_state(pose._replace(time=99.0), np.zeros(3), DIALECTS[version])
+    later = encode_state(pose._replace(time=99.0), np.zeros(3), CONVENTIONS[version])
     assert struct.unpack("<18d", later)[0] == numbers[0]  # a constant stamp
 
 
 def test_motors_are_put_in_order_and_within_limits() -> None:
     data = struct.pack("<4f", 0.1, 0.2, 0.3, 0.4)
-    assert decode_motors(data, DIALECTS["2026.6"]) == pytest.approx((0.1, 0.2, 0.3, 0.4))
-    assert decode_motors(data, DIALECTS["before"]) == pytest.approx((0.4, 0.1, 0.2, 0.3))  # M2 M3 M4 M1
-    wild = decode_motors(struct.pack("<4f", -0.5, 1.5, 0.0, 1.0), DIALECTS["2026.6"])
+    assert decode_motors(data, CONVENTIONS["2026.6"]) == pytest.approx((0.1, 0.2, 0.3, 0.4))
+    assert decode_motors(data, CONVENTIONS["before"]) == pytest.approx((0.4, 0.1, 0.2, 0.3))  # M2 M3 M4 M1
+    wild = decode_motors(struct.pack("<4f", -0.5, 1.5, 0.0, 1.0), CONVENTIONS["2026.6"])
     assert wild == pytest.approx((0.0, 1.0, 0.0, 1.0))
     for bad in (
         b"",
@@ -88,7 +88,7 @@ def test_motors_are_put_in_order_and_within_limits() -> None:
         struct.pack("<4f", math.nan, 0, 0, 0),
         struct.pack("<4f", math.inf, 0, 0, 0),
     ):
-        assert decode_motors(bad, DIALECTS["2026.6"]) is None
+        assert decode_motors(bad, CONVENTIONS["2026.6"]) is None
 
 
 @pytest.mark.parametrize(
@@ -180,14 +180,14 @@ def test_an_unknown_firmware_is_refused() -> None:
 
 
 @pytest.mark.parametrize(
-    ("release", "dialect"),
+    ("release", "convention"),
     [
         *(("4.5", "before"), ("4.6.0", "before"), ("2025.12.1", "before"), ("before", "before")),
         *(("2026.6", "2026.6"), ("2026.12.0-alpha", "2026.6"), ("2027.6", "2026.6")),
     ],
 )
-def test_a_release_has_its_dialect(release: str, dialect: str) -> None:
-    assert dialect_of(release) is DIALECTS[dialect]
+def test_a_release_has_its_convention(release: str, convention: str) -> None:
+    assert convention_of(release) is CONVENTIONS[convention]
 
 
 # The whole loop around a firmware: pilot → channels → the firmware's rate loop → motors → plant → poses → pilot.
@@ -199,16 +199,16 @@ THRUST = ThrustMap(mass=0.6, full_thrust=16.0, reference_voltage=15.0, voltage=1
 
 
 class Radio:
-    """A transport to the firmware that can be pulled out; it keeps what was sent."""
+    """A transport to the firmware that can be disconnected; it keeps what was sent."""
 
     def __init__(self, firmware: Firmware) -> None:
         self._firmware = firmware
         self.sent: list[tuple[int, ...]] = []
-        self.pulled = False
+        self.disconnected = False
 
     def write(self, data: bytes) -> bool:
         self.sent.append(struct.unpack("<d16H", data)[1:])
-        if not self.pulled:
+        if not self.disconnected:
             self._firmware.hear(data)
         return True
 
@@ -237,7 +237,7 @@ class SitlStep(LockStep):
         self.disarmed_at: float | None = None  # s, after it was armed
 
     def send(self, command: Command) -> bytes:
-        self.radio.pulled = self.pull_after is not None and self.elapsed >= self.pull_after
+        self.radio.disconnected = self.pull_after is not None and self.elapsed >= self.pull_after
         return self._link.send(command)
 
     def sleep_until(self, deadline: float) -> None:

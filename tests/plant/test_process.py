@@ -89,9 +89,10 @@ def test_the_failsafe_cuts_when_its_time_is_over_however_time_passes(fresh: Plan
     plant.advance_to(2.0)  # in one go: the cut is where it belongs
     assert not fresh.armed
     fall = 0.5 * GRAVITY * 0.25**2
-    assert fall < 1.35 and fresh.fate.endswith("when disarmed")
+    assert fall < 1.35 and fresh.crash_description.endswith("when disarmed")
     seconds_to_ground = math.sqrt(2 * 1.3 / GRAVITY)
-    assert float(fresh.fate.split()[2]) - (fresh.time - 2.0) == pytest.approx(0.45 + seconds_to_ground, abs=0.05)
+    crashed_at = float(fresh.crash_description.split()[2])
+    assert crashed_at - (fresh.time - 2.0) == pytest.approx(0.45 + seconds_to_ground, abs=0.05)
     assert (
         "2 commands" not in plant.summary()
         and "3 commands (0 lost, 0 stale, 0 malformed), 1 failsafe(s)" in plant.summary()

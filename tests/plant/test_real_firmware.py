@@ -21,7 +21,7 @@ from dreamer_racing.hil.links.tcp import TcpTransport
 from dreamer_racing.hil.safety_limits import SafetyLimits
 from dreamer_racing.hil.sticks import ThrustMap
 from dreamer_racing.hil.vehicle import GRAVITY, Command, Setpoint, at_rest
-from dreamer_racing.plant.betaflight_sitl import DIALECTS, dialect_of
+from dreamer_racing.plant.betaflight_sitl import CONVENTIONS, convention_of
 from dreamer_racing.plant.firmware_step import FirmwareStep, Radio, SteppedFirmware
 from dreamer_racing.plant.lock_step import make_chain
 from dreamer_racing.plant.pilot import PilotFlyer
@@ -47,7 +47,7 @@ def msp_link(firmware: SteppedFirmware) -> ChannelLink:
 
 def ready(firmware: SteppedFirmware, link: TransportLink, track: str = "circle") -> FirmwareStep:
     step = FirmwareStep(PlantVehicle(track, "faithful"), firmware, link)
-    step.get_ready()
+    step.wait_until_ready()
     return step
 
 
@@ -82,7 +82,7 @@ def test_it_is_set_up_as_is_wanted_and_what_it_does_not_know_is_named(set_up: Se
         str(found) for found in check_dump(firmware.dump, contract, "betaflight_sitl") if found.status is not Status.OK
     ] == []
     assert all(wanted[line].absent and "INVALID" in words for line, words in firmware.refused.items())
-    assert dialect_of(firmware.release) in DIALECTS.values()
+    assert convention_of(firmware.release) in CONVENTIONS.values()
 
 
 def test_it_is_the_same_each_time(set_up: SetUp) -> None:
@@ -133,7 +133,7 @@ def test_what_is_told_to_disarm_stops_within_a_few_hundredths_of_a_second(set_up
 @pytest.mark.parametrize("link", ["betaflight_sitl", "msp"])
 def test_a_link_that_is_lost_stops_the_motors_by_the_firmwares_own_failsafe(set_up: SetUp, link: str) -> None:
     firmware = set_up(link)
-    if link == "betaflight_sitl" and dialect_of(firmware.firmware.release) is DIALECTS["before"]:
+    if link == "betaflight_sitl" and convention_of(firmware.firmware.release) is CONVENTIONS["before"]:
         pytest.skip(
             "before 2026.6 the firmware's radio over UDP counts as heard for ever: its failsafe is tried by MSP"
         )
@@ -150,9 +150,9 @@ def test_what_does_not_arm_says_why(set_up: SetUp) -> None:
     radio = Radio(firmware)
     link = ChannelLink(SitlTransport(radio, serial), encode_sitl, RATES, THRUST, telemetry=MspTelemetry())
     step = FirmwareStep(PlantVehicle("circle", "faithful"), firmware, link)
-    radio.pulled = True
+    radio.disconnected = True
     assert talk(step, at_rest(), 2.0).startswith("RXLOSS: it hears no valid channels")
-    radio.pulled = False
+    radio.disconnected = False
     assert talk(step, at_rest(), 2.0) == ""
     assert "THROTTLE: the throttle is not low" in talk(step, asked(), 1.0) and not step.plant.vehicle.armed
     assert "ARM_SWITCH" in talk(step, asked(thrust=0.0), 1.0), "low now, but the switch was on before"
@@ -226,7 +226,7 @@ def test_what_a_dead_computer_said_last_stands_or_is_dropped_as_the_guide_says(s
     talk(step, asked(x=0.7), 0.4)
     step.plant.advance_to(step.plant.time + 0.6)
     rate = step.plant.vehicle.pose().body_rates[0]
-    if dialect_of(firmware.firmware.release) is DIALECTS["before"]:
+    if convention_of(firmware.firmware.release) is CONVENTIONS["before"]:
         assert rate == pytest.approx(0.7, rel=0.2), "for ever"
         receiver.hands_over = False
         step.plant.advance_to(step.plant.time + 0.3)
@@ -247,7 +247,7 @@ def test_a_lap_beside_a_receiver_until_the_pilot_takes_back(set_up: SetUp) -> No
     step.after_step = take_part
     step.enable_after = step.elapsed + 2.0
     ended = step.fly(chain_of(step, PilotFlyer(vehicle.track, "faithful"), laps=3), 50.0, 40.0)
-    print(step.elapsed, vehicle.fate, vehicle.gates_passed, vehicle.lap_times, step.refusal)
+    print(step.elapsed, vehicle.crash_description, vehicle.gates_passed, vehicle.lap_times, step.refusal)
     assert ended == "cut: the flight controller refuses: the pilot flies it: MSP OVERRIDE is off"
     assert vehicle.gates_passed == 5 and len(vehicle.lap_times) == 1
     link.close()
@@ -262,7 +262,7 @@ def test_the_pilot_races_three_laps(set_up: SetUp, track: str) -> None:
     assert step.fly(chain_of(step, PilotFlyer(vehicle.track, "faithful"), laps=3), 50.0, 40.0) == (
         "disarmed: the flight is over"
     )
-    assert len(vehicle.lap_times) == 3 and vehicle.fate.endswith("when disarmed")
+    assert len(vehicle.lap_times) == 3 and vehicle.crash_description.endswith("when disarmed")
     assert max(vehicle.lap_times) < {"circle": 3.6, "kidney": 4.7, "figure8": 5.1}[track]
 
 

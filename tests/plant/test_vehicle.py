@@ -227,13 +227,14 @@ def test_a_crash_ends_it_until_it_is_put_back() -> None:
     vehicle = flying()
     vehicle.command(armed(20.0))
     vehicle.advance(2.0)
-    assert vehicle.crash is CrashCause.OUT_OF_BOUNDS and vehicle.fate.startswith("out of bounds at ")
+    assert vehicle.crash is CrashCause.OUT_OF_BOUNDS and vehicle.crash_description.startswith("out of bounds at ")
     vehicle.advance(2.5)
     assert vehicle.pose().position == pytest.approx((4.0, -2.5, 0.05), abs=1e-6)
     assert vehicle.pose().linear_velocity == pytest.approx(np.zeros(3))
     time = vehicle.time
     vehicle.reset()
-    assert vehicle.on_stand and vehicle.crash is CrashCause.NONE and not vehicle.armed and vehicle.fate == "none"
+    assert vehicle.on_stand and not vehicle.armed
+    assert vehicle.crash is CrashCause.NONE and vehicle.crash_description == "none"
     assert vehicle.pose().position == pytest.approx(START) and vehicle.time == time
     vehicle.command(armed(GRAVITY))
     vehicle.advance(1.0)
@@ -244,7 +245,7 @@ def test_falling_because_it_was_disarmed_is_said() -> None:
     vehicle = flying()
     vehicle.command(at_rest())
     vehicle.advance(1.0)
-    assert vehicle.crash is CrashCause.GROUND and vehicle.fate.endswith(", when disarmed")
+    assert vehicle.crash is CrashCause.GROUND and vehicle.crash_description.endswith(", when disarmed")
 
 
 @pytest.mark.parametrize("preset", ["easy", "faithful", "betaflight"])

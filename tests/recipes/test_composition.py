@@ -74,10 +74,10 @@ def test_an_algorithm_without_a_learner_is_a_defect_that_says_so() -> None:
 def test_decoys_are_a_config_group() -> None:
     arena, dreamer = recipe_module("composing.building"), recipe_module("dreamer_v3")
     config = OmegaConf.to_object(dreamer.resolve(compose("dreamer_v3", "track=figure8", "+decoys=paper")))
-    assert arena.worlds_of(config)["track"] == load_track("figure8_decoys")
+    assert arena.shared_env_arguments(config)["track"] == load_track("figure8_decoys")
     config.track = "circle"
     with pytest.raises(ValueError, match=r"decoys=paper is for track=figure8; track 'circle'"):
-        arena.worlds_of(config)
+        arena.shared_env_arguments(config)
     assert OmegaConf.to_object(compose("evaluate", "checkpoint=x", "+decoys=none")).decoys == "none"
 
 

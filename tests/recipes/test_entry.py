@@ -14,7 +14,7 @@ import torch
 from hydra.errors import HydraException
 
 from dreamer_racing.figures.plotting import PlotConfig
-from dreamer_racing.training.schedule import LOOKS
+from dreamer_racing.training.schedule import MEDIAN_WINDOW
 from tests.running_recipes import CONFIG, ROOT, TINY, compose, open_session, recipe, recipe_module
 
 
@@ -44,7 +44,7 @@ from tests.running_recipes import CONFIG, ROOT, TINY, compose, open_session, rec
     ],
 )
 def test_whole_numbers_may_be_written_short_and_paths_as_they_are(argument: str, taken: str) -> None:
-    assert recipe_module("composing.entry").readable(argument) == taken
+    assert recipe_module("composing.entry").normalise_argument(argument) == taken
 
 
 def test_a_setting_of_other_recipes_is_said_to_be_theirs() -> None:
@@ -109,7 +109,7 @@ def test_what_hydra_refuses_is_said_in_plain_words(override: str, words: str) ->
     ],
 )
 def test_what_is_a_setting_is_taken(recipe_name: str, taken: list[str]) -> None:
-    recipe_module("composing.options").refuse_slips(recipe_name, taken)
+    recipe_module("composing.options").check_arguments(recipe_name, taken)
 
 
 @pytest.mark.parametrize(
@@ -123,7 +123,7 @@ def test_what_is_a_setting_is_taken(recipe_name: str, taken: list[str]) -> None:
 )
 def test_what_is_none_is_refused(overrides: list[str], words: str) -> None:
     with pytest.raises(ValueError, match=words):
-        recipe_module("composing.options").refuse_slips("dreamer_v3", overrides)
+        recipe_module("composing.options").check_arguments("dreamer_v3", overrides)
 
 
 def test_a_recipe_is_still_its_function(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -223,7 +223,7 @@ def test_the_actor_waits_while_the_newest_records_are_not_known(
 ) -> None:
     latent_ppo, measuring = recipe_module("latent_ppo"), recipe_module("composing.building")
     config, session = open_session(
-        *SETTINGS, f"run_dir={tmp_path}", f"total_env_steps={32 * (12 + LOOKS)}", name="latent_ppo"
+        *SETTINGS, f"run_dir={tmp_path}", f"total_env_steps={32 * (12 + MEDIAN_WINDOW)}", name="latent_ppo"
     )
     looked, waited = [], []
 

@@ -101,7 +101,7 @@ def test_training_and_evaluation_have_them_and_the_run_remembers(folder: Path) -
     config = saved.trained_config(folder)
     trained_in, flown_in = (
         arena.make_env(config),
-        DroneRacingEnv(num_envs=1, evaluation=True, **arena.worlds_of(config)),
+        DroneRacingEnv(num_envs=1, evaluation=True, **arena.shared_env_arguments(config)),
     )
     for env in (trained_in, flown_in):
         interface = Interface.of(env)
@@ -197,11 +197,11 @@ def test_the_track_of_a_file_is_noted_when_a_run_begins(track: Track, tmp_path: 
     write(track, file)
     dreamer = recipe_module("dreamer_v3")
     config = OmegaConf.to_object(dreamer.resolve(compose("dreamer_v3", f"track={file}", "model=debug")))
-    assert config.track_as_begun() == track
+    assert config.saved_track() == track
     file.write_text("gates: []", encoding="utf-8")
-    assert config.track_as_begun() == track
+    assert config.saved_track() == track
     built_in = OmegaConf.to_object(dreamer.resolve(compose("dreamer_v3", "track=kidney", "model=debug")))
-    assert (built_in.track_as_begun(), built_in.track_description) == (load_track("kidney"), None)
+    assert (built_in.saved_track(), built_in.track_description) == (load_track("kidney"), None)
 
 
 def test_what_a_run_notes_is_not_to_be_given() -> None:

@@ -200,7 +200,7 @@ def test_a_setting_of_another_algorithm_is_refused_with_the_recipe_that_takes_it
 ) -> None:
     key = setting.partition("=")[0]
     with pytest.raises(ValueError, match=rf"{key}: there is no such setting of .*{name}.py; it is for .*{other}.py"):
-        recipe_module("composing.options").refuse_slips(name, [setting])
+        recipe_module("composing.options").check_arguments(name, [setting])
 
 
 @pytest.mark.parametrize(

@@ -103,7 +103,7 @@ def test_a_reader_that_has_read_enough_is_no_error(tmp_path: Path) -> None:
 
 def test_other_programs_keep_their_help(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(sys, "argv", ["/somewhere/export.py", "--help"])
-    options.answer_early()
+    options.handle_help_and_typos()
 
 
 # Every option of every recipe takes a value or refuses it in plain words, whatever the value.
@@ -148,7 +148,7 @@ def check(recipe: str, config: DictConfig) -> None:
     elif recipe == "experiment":
         module.check(config)
     else:
-        settings = recipe_module("composing.entry").typed(config)
+        settings = recipe_module("composing.entry").to_checked_object(config)
         getattr(module, "check", lambda checked: None)(settings)
 
 
@@ -162,7 +162,7 @@ def test_every_option_takes_a_value_or_refuses_it_in_plain_words(
     @given(st.sampled_from(options), values)
     @hypothesis_settings(max_examples=8, deadline=None, suppress_health_check=list(HealthCheck))
     def attempt(name: str, value: str) -> None:
-        override = entry.readable(f"{name}={value}")
+        override = entry.normalise_argument(f"{name}={value}")
         capsys.readouterr()
         try:
             with plain_errors():

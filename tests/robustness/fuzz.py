@@ -257,11 +257,11 @@ def overrides(draw: random.Random, folder: Path) -> Iterator[Callable[[], bool]]
     def case() -> bool:
         chosen = draw.choices(names, k=draw.choice((1, 1, 1, 2, 3)))
         given = [f"{draw.choice(('',) * 8 + ('+', '~'))}{name}={value()}" for name in chosen]
-        given = ["device=cpu", *(entry.readable(override) for override in given)]
+        given = ["device=cpu", *(entry.normalise_argument(override) for override in given)]
         quiet = io.StringIO()
         try:
             with contextlib.redirect_stdout(quiet), contextlib.redirect_stderr(quiet), entry.plain_errors():
-                options.refuse_slips("dreamer_v3", given)
+                options.check_arguments("dreamer_v3", given)
                 with hydra.initialize_config_dir(config_dir, version_base="1.3"):
                     config = hydra.compose("dreamer_v3", overrides=given)
                 checks.check_overrides(config, given)

@@ -77,7 +77,7 @@ def test_a_log_gets_whole_lines_now_and_then(capsys: pytest.CaptureFixture[str])
         progress.show({"evaluation/success_rate": 0.5, "evaluation/lap_time_mean": 4.5})
         progress.advance(512_000, updates=0)
         progress.show(METRICS)
-        progress.say("evaluation at 512,000 env_steps")
+        progress.write_line("evaluation at 512,000 env_steps")
     said = capsys.readouterr()
     assert "\r" not in said.err + said.out
     first, second = said.err.splitlines()
@@ -119,7 +119,7 @@ def test_a_log_that_takes_no_more_ends_nothing(monkeypatch: pytest.MonkeyPatch) 
     full = Path("/dev/full").open("w")  # noqa: SIM115 -- its end fails, as everything does
     monkeypatch.setattr(sys, "stdout", full)
     with Progress(total=100) as progress:
-        progress.say("evaluation")
+        progress.write_line("evaluation")
     with pytest.raises(OSError, match="No space left"):
         full.close()
 
@@ -128,7 +128,7 @@ def test_of_several_processes_one_alone_speaks(capsys: pytest.CaptureFixture[str
     with Progress(total=10, seconds=0.0, shown=False) as progress:
         progress.show(METRICS)
         progress.evaluating(12, 60)
-        progress.say("evaluation")
+        progress.write_line("evaluation")
     assert capsys.readouterr() == ("", "")
 
 
@@ -313,7 +313,7 @@ def test_what_is_said_stands_above_and_the_table_stays(monkeypatch: pytest.Monke
     terminal = open_terminal(monkeypatch)
     with Progress(total=100) as progress:
         progress.show(TRAINING)
-        progress.say("evaluation at 50 env_steps: gates 3.00 (the best so far)")
+        progress.write_line("evaluation at 50 env_steps: gates 3.00 (the best so far)")
     assert terminal.screen[0] == "evaluation at 50 env_steps: gates 3.00 (the best so far)"
     assert terminal.screen[1].startswith("  0%|") and terminal.screen[3].split()[:3] == ["training", "0", "12.35"]
     assert terminal.screen[5:] == [""]  # what a shell prints next begins below
@@ -338,7 +338,7 @@ def test_ctrl_c_is_answered_above_whatever_is_being_drawn(number: int, monkeypat
     monkeypatch.setattr("dreamer_racing.training.progress.write_at_once", terminal.write)
     monkeypatch.setattr(logging.root, "handlers", [logging.StreamHandler(terminal)])
     with GracefulExit("saving") as stop, Progress(total=100) as progress:
-        stop.say = progress.answer
+        stop.write = progress.write_from_handler
         interrupted.left = number
         progress.evaluating(3, 5)
         logging.getLogger("dreamer_racing.test").warning("the disk is slow")
@@ -349,7 +349,7 @@ def test_ctrl_c_is_answered_above_whatever_is_being_drawn(number: int, monkeypat
         assert stop.requested and terminal.screen.count("SIGINT: saving") == 1
         progress.advance(50, updates=0)
         progress.show(EVALUATION)
-        progress.say("saved")
+        progress.write_line("saved")
     screen = [line.replace("^C", "").rstrip() for line in terminal.screen]  # its echo stands where the cursor was
     assert sorted(screen[:3]) == ["SIGINT: saving", "saved", "the disk is slow"] and screen[2] == "saved"
     assert screen[3].startswith(" 50%|") and screen[4].split()[0] == "env_steps"

@@ -9,8 +9,8 @@ import pytest
 import torch
 from tensordict import TensorDict
 
-from dreamer_racing.training.episodes import KNOWN, MEMORY, PACE, GatePassRate
-from dreamer_racing.training.schedule import LOOKS, PATIENCE, ModelLag, Ramp, RampClock, ReplayRatio
+from dreamer_racing.training.episodes import KNOWN_PASS_RATE, MEMORY, MIN_PROGRESS_RATE, GatePassRate
+from dreamer_racing.training.schedule import MEDIAN_WINDOW, PATIENCE, ModelLag, Ramp, RampClock, ReplayRatio
 
 
 @pytest.mark.parametrize(
@@ -93,7 +93,7 @@ def test_an_episode_counts_the_gates_after_its_first():
     assert passes.share == 0.0
     passes.update(episodes([3], [0], [1]), 0)  # from gate 0 on: 0 does not count, 1 and 2 are passed, crash before 0
     assert passes.shares.tolist() == [0.0, 1.0, 1.0]
-    assert passes.share == 0.0 and passes.hardest_gate == 0
+    assert passes.share == 0.0 and passes.lowest_rate_gate == 0
     passes.update(episodes([], [], []), 0)
     passes.update(episodes([0, 1], [0, 1], [1, 0]), 0)  # a crash before the first gate, and time that ran out after it
     assert passes.shares.tolist() == [0.0, 1.0, 1.0]
@@ -103,7 +103,7 @@ def test_laps_count_each_pass():
     passes = GatePassRate(3)
     passes.update(episodes([7, 1, 1], [2, 1, 1], [0, 2, 3]), 0)  # 1, then 2 0 1 2 0 1; twice 0 and a crash at 1
     assert passes.shares.tolist() == pytest.approx([1.0, 2 / 4, 1.0], abs=0.01)
-    assert passes.share == pytest.approx(0.5, abs=0.01) and passes.hardest_gate == 1
+    assert passes.share == pytest.approx(0.5, abs=0.01) and passes.lowest_rate_gate == 1
 
 
 def test_where_there_are_no_gates_the_share_stays_0():
@@ -126,22 +126,22 @@ def test_once_the_hardest_gate_is_known_its_clock_goes_on_by_itself():
     passes = GatePassRate(2)
     for _ in range(4):
         passes.update(episodes([150, 149], [0, 1], [0, 1]), 500)  # past both, but for a crash now and then
-    assert passes.best > KNOWN and passes.known_since == 500
+    assert passes.best > KNOWN_PASS_RATE and passes.known_since == 500
     passes.best = 0.5
     passes.update(episodes([2], [0], [0]), 700)
     assert passes.known_since == 500
     passes.best = 0.5
-    assert passes.known(510, 1000) == 0.5  # 0.43 by time
-    assert passes.known(600, 1000) == pytest.approx(KNOWN + 0.1 * PACE)
+    assert passes.progress(510, 1000) == 0.5  # 0.43 by time
+    assert passes.progress(600, 1000) == pytest.approx(KNOWN_PASS_RATE + 0.1 * MIN_PROGRESS_RATE)
     resumed = GatePassRate(0)
     resumed.load_state_dict(passes.state_dict())
-    assert resumed.known(600, 1000) == passes.known(600, 1000)
+    assert resumed.progress(600, 1000) == passes.progress(600, 1000)
 
 
 def test_before_that_the_clock_is_the_best_share():
     passes = GatePassRate(2)
     passes.best = 0.3
-    assert passes.known(900, 1000) == 0.3 and passes.known_since is None
+    assert passes.progress(900, 1000) == 0.3 and passes.known_since is None
 
 
 def test_old_attempts_are_forgotten_and_a_resumed_run_remembers_what_is_left():
@@ -154,7 +154,7 @@ def test_old_attempts_are_forgotten_and_a_resumed_run_remembers_what_is_left():
     assert before == 1.0 and 0.2 < passes.share < 0.6
     resumed = GatePassRate(0)
     resumed.load_state_dict(passes.state_dict())
-    assert (resumed.share, resumed.best, resumed.hardest_gate) == (passes.share, passes.best, 0)
+    assert (resumed.share, resumed.best, resumed.lowest_rate_gate) == (passes.share, passes.best, 0)
 
 
 # When a policy waits for its model.
@@ -166,17 +166,17 @@ def of(error: float) -> dict[str, torch.Tensor]:
 
 def measure(lag: ModelLag, ratio: float) -> float | torch.Tensor:
     for _ in range(3):
-        lag.trained(of(0.5))
-    return lag.measured(of(0.5 * ratio))["lag/ratio"]
+        lag.add_training_error(of(0.5))
+    return lag.add_fresh_error(of(0.5 * ratio))["lag/ratio"]
 
 
 def test_it_waits_above_the_limit_and_goes_on_below():
     lag = ModelLag(limit=1.25)
     assert measure(lag, 1.2) == pytest.approx(1.2) and not lag.waits
-    for _ in range(LOOKS):
+    for _ in range(MEDIAN_WINDOW):
         measure(lag, 1.5)
     assert lag.waits
-    for _ in range(LOOKS):
+    for _ in range(MEDIAN_WINDOW):
         measure(lag, 1.0)
     assert not lag.waits
 
@@ -185,7 +185,7 @@ def test_one_odd_flight_is_no_lag_and_one_good_one_not_its_end():
     lag = ModelLag(limit=2.0)
     for ratio in (1.0, 1.0, 1.0, 30.0, 1.0, 1.0):
         assert measure(lag, ratio) == pytest.approx(1.0) and not lag.waits
-    for _ in range(LOOKS):
+    for _ in range(MEDIAN_WINDOW):
         measure(lag, 3.0)
     assert measure(lag, 1.0) == pytest.approx(3.0) and lag.waits
 
@@ -194,9 +194,9 @@ def test_it_does_not_wait_for_ever_and_again_only_after_the_model_has_caught_up(
     lag = ModelLag(limit=2.0)
     waited = [measure(lag, 3.0) and lag.waits for _ in range(2 * PATIENCE)]
     assert waited == [True] * PATIENCE + [False] * PATIENCE
-    for _ in range(LOOKS):
+    for _ in range(MEDIAN_WINDOW):
         measure(lag, 1.0)
-    for _ in range(LOOKS):
+    for _ in range(MEDIAN_WINDOW):
         measure(lag, 3.0)
     assert lag.waits
 
@@ -204,22 +204,22 @@ def test_it_does_not_wait_for_ever_and_again_only_after_the_model_has_caught_up(
 def test_the_training_error_is_the_mean_since_the_last_measurement():
     lag = ModelLag(limit=9.0)
     for error in (1.0, 2.0, 3.0):
-        lag.trained(of(error))
-    assert lag.measured(of(4.0))["lag/ratio"] == pytest.approx(2.0)
+        lag.add_training_error(of(error))
+    assert lag.add_fresh_error(of(4.0))["lag/ratio"] == pytest.approx(2.0)
 
 
 def test_without_a_limit_or_before_any_update_it_never_waits():
     lag = ModelLag(limit=None)
     assert not lag.due(10_000) and math.isnan(measure(lag, 100.0)) and not lag.waits
     lag = ModelLag(limit=1.1)
-    assert math.isnan(lag.measured(of(1.0))["lag/ratio"]) and not lag.waits
-    assert lag.measured({"loss": torch.tensor(1.0)}) == {}
+    assert math.isnan(lag.add_fresh_error(of(1.0))["lag/ratio"]) and not lag.waits
+    assert lag.add_fresh_error({"loss": torch.tensor(1.0)}) == {}
 
 
 def test_a_restored_one_goes_on_as_if_it_had_never_stopped():
     lag = ModelLag(limit=1.25)
     measure(lag, 1.5)
-    lag.trained(of(0.5))
+    lag.add_training_error(of(0.5))
     other = ModelLag(limit=1.25)
     other.load_state_dict(lag.state_dict())
     for ratio in (1.1, 3.0, 1.0, 1.0):
@@ -240,7 +240,7 @@ def test_it_is_measured_once_a_period_and_tells_when_the_actor_waits(caplog: pyt
     lag = ModelLag(limit=2.0, every=100)
     assert [steps for steps in range(0, 450, 30) if lag.due(steps)] == [120, 210, 300, 420]
     with caplog.at_level("INFO", "dreamer_racing"):
-        for ratio in (1.0, *(3.0,) * LOOKS, *(1.0,) * LOOKS):
+        for ratio in (1.0, *(3.0,) * MEDIAN_WINDOW, *(1.0,) * MEDIAN_WINDOW):
             measure(lag, ratio)
     assert len(caplog.messages) == 2
     assert caplog.messages[0].startswith("the actor waits: ") and caplog.messages[0].endswith("(wait_for_model=2)")

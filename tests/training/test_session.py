@@ -225,14 +225,14 @@ import sys, time
 from dreamer_racing.training.progress import Progress
 from dreamer_racing.training.signals import GracefulExit
 with GracefulExit("saving") as stop, Progress(total=1000) as progress:
-    stop.say = progress.answer
+    stop.write = progress.write_from_handler
     open(sys.argv[1], "w").close()
     while not stop.requested:
         time.sleep(0.01)
     for number in range(20):
         progress.advance(number, updates=0)
         progress.show({"episode/return": 1.0})
-        progress.say("saved")
+        progress.write_line("saved")
         print("saved", flush=True)
 open(sys.argv[1], "a").write("ended well")
 """

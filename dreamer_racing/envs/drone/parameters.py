@@ -12,7 +12,13 @@ from pathlib import Path
 from typing import Any
 
 from dreamer_racing.envs.drone.betaflight import BetaflightParameters
-from dreamer_racing.envs.drone.variations import SUFFIXES, differing, read_variation, vary, write_variation
+from dreamer_racing.envs.drone.variations import (
+    SUFFIXES,
+    apply_changes,
+    field_differences,
+    read_variation,
+    write_variation,
+)
 from dreamer_racing.settings import (
     NOT_NEGATIVE,
     POSITIVE,
@@ -183,7 +189,7 @@ def _read_drone(path: Path) -> QuadrotorParameters:
         there = ", ".join(sorted(PRESETS))
         raise ValueError(f"{path}: preset: {quoted(base)} is none of {there}{suggestion(base, PRESETS)}.")
     try:
-        return vary(PRESETS[base], changes)
+        return apply_changes(PRESETS[base], changes)
     except (ValueError, TypeError) as error:
         raise ValueError(f"{path}: {error}") from error
 
@@ -197,7 +203,7 @@ def save_drone(path: Path, drone: QuadrotorParameters, about: Mapping[str, Any])
         about: Sources of its numbers, plain values.
     """
     base = "faithful" if drone.betaflight is None else "betaflight"
-    write_variation(path, base, differing(PRESETS[base], drone), about)
+    write_variation(path, base, field_differences(PRESETS[base], drone), about)
 
 
 MIN_CONTROL_RATE = 10.0

@@ -17,7 +17,7 @@ import torch
 from torch import Tensor
 
 from dreamer_racing.envs.drone.parameters import GRAVITY, ROTOR_SPINS, QuadrotorParameters, Randomisation
-from dreamer_racing.envs.drone.rate_loop import Own, RateLoop
+from dreamer_racing.envs.drone.rate_loop import DroneParameter, RateLoop
 from dreamer_racing.envs.drone.rotation import rotate_inverse
 
 RELATIVE = ("mass", "inertia", "drag", "thrust", "torque")  # parameters that are randomised by a factor
@@ -151,17 +151,17 @@ class Quadrotor:
         delay = (delay / self.parameters.physics_dt).round().long()
         drones.delay_steps.copy_(torch.where(rows[:, 0], delay, drones.delay_steps))
         if self.rate_loop is not None:
-            own = self.rate_loop.own
+            own = self.rate_loop.drone_parameters
             noise = 2.0 * self._uniform(self.num_drones, 4, 3) - 1.0
             relative = torch.cat((1.0 + widths.gains * noise[:, :3], 1.0 + widths.filters * noise[:, 3:]), dim=1)
-            own[:, : Own.MOTORS] = torch.where(rows.unsqueeze(-1), relative, own[:, : Own.MOTORS])
+            own[:, : DroneParameter.MOTORS] = torch.where(rows.unsqueeze(-1), relative, own[:, : DroneParameter.MOTORS])
             lag = 1.0 + widths.motor_lag * (2.0 * self._uniform(self.num_drones, 1) - 1.0)
             self._set_motors(rows, lag, widths.sag_max * self._uniform(self.num_drones, 1))
 
     def _set_motors(self, rows: Tensor, lag: Tensor | float, sag: Tensor | float) -> None:
         """Set the relative motor lag and the battery sag at full load of the masked drones (N, 1) bool."""
         assert self.rate_loop is not None
-        motors = self.rate_loop.own[:, Own.MOTORS]
+        motors = self.rate_loop.drone_parameters[:, DroneParameter.MOTORS]
         decay = math.log(self.motor_decay) / (torch.ones_like(motors[:, :1]) * lag)
         values = torch.cat((decay.exp(), (0.5 * decay).exp(), torch.zeros_like(decay) + sag), dim=1)
         motors.copy_(torch.where(rows, values, motors))
@@ -178,7 +178,10 @@ class Quadrotor:
         )
         state = {"rotor_speed": self.rotor_speed.clone(), "setpoints": self.setpoints.clone(), "drones": drones}
         if self.rate_loop is not None:
-            state |= {"rate_loop": self.rate_loop.state.clone(), "rate_loop_own": self.rate_loop.own.clone()}
+            state |= {
+                "rate_loop": self.rate_loop.state.clone(),
+                "rate_loop_own": self.rate_loop.drone_parameters.clone(),
+            }
         return state
 
     def load_state_dict(self, state_dict: Mapping[str, Any]) -> None:
@@ -190,7 +193,7 @@ class Quadrotor:
                 getattr(self._drones, name).copy_(value)
         if self.rate_loop is not None:
             self.rate_loop.state.copy_(state_dict["rate_loop"])
-            self.rate_loop.own.copy_(state_dict["rate_loop_own"])
+            self.rate_loop.drone_parameters.copy_(state_dict["rate_loop_own"])
 
     def command(self, action: Tensor) -> None:
         """Set the actions (N, 4) in [-1, 1] of the next control step: collective thrust and body rates x, y, z."""
@@ -232,14 +235,14 @@ class Quadrotor:
         else:
             commands = self.rate_loop.motor_commands(setpoint, body_rates)
             target = commands * math.sqrt(self.parameters.rotor_thrust_max)
-        self._note_effort(physics_step, setpoint[:, :1], target.square())
+        self._accumulate_effort(physics_step, setpoint[:, :1], target.square())
         thrusts = self._turn_rotors(target)
         wrench = _product(thrusts, self._effectiveness)
         if self._has_drag or self._drones is not None:
             wrench = self._perturb(wrench, attitude, linear_velocity, body_rates, gyroscopic)
         return wrench
 
-    def _note_effort(self, physics_step: int, asked: Tensor, targets: Tensor) -> None:
+    def _accumulate_effort(self, physics_step: int, asked: Tensor, targets: Tensor) -> None:
         """Add a physics step with commanded collective thrust (N, 1) and rotor thrust targets (N, 4) to `effort`."""
         low, high = targets.aminmax(dim=1, keepdim=True)
         at_limit = (low <= self.thrust_min + 1e-6) | (high >= self.parameters.rotor_thrust_max - 1e-6)
@@ -252,7 +255,7 @@ class Quadrotor:
         decay: Tensor | float = self.motor_decay
         decay_half: Tensor | float = self._motor_decay_half
         if self.rate_loop is not None:
-            decay, decay_half, sag = self.rate_loop.own[:, Own.MOTORS].split(1, dim=1)
+            decay, decay_half, sag = self.rate_loop.drone_parameters[:, DroneParameter.MOTORS].split(1, dim=1)
         speed = self.rotor_speed
         if self._lag_of_thrust:
             target, speed = target.square(), speed.square()

@@ -40,7 +40,7 @@ class Row(enum.IntEnum):
     ANTI_GRAVITY = 13  # first low-pass, second low-pass, unused
 
 
-class Own(enum.IntEnum):
+class DroneParameter(enum.IntEnum):
     """Rows of the parameters that may differ between drones, three numbers each."""
 
     P = 0  # relative, by axis
@@ -76,7 +76,7 @@ class RateLoop:
 
     Attributes:
         state: (N, rows of `Row`, 3) their state, updated in place.
-        own: (N, rows of `Own`, 3) their individual parameters, updated in place.
+        drone_parameters: (N, rows of `DroneParameter`, 3) their individual parameters, updated in place.
 
     Example:
         >>> from dataclasses import replace
@@ -114,7 +114,7 @@ class RateLoop:
         self.level = tensor((1.0, 1.0, 0.0))  # axes with I-term relax and anti-gravity
         self.mix = tensor(MIX)  # (3, 4)
         self.state = torch.zeros(num_drones, len(Row), 3, device=device, dtype=dtype)
-        self.own = torch.ones(num_drones, len(Own), 3, device=device, dtype=dtype)
+        self.drone_parameters = torch.ones(num_drones, len(DroneParameter), 3, device=device, dtype=dtype)
         self.hover_throttle = self._throttle(tensor([parameters.mass * GRAVITY])).item()
         self.reset(torch.ones(num_drones, 1, dtype=torch.bool, device=device))
 
@@ -174,7 +174,7 @@ class RateLoop:
         self.receive(setpoint.to(self.state))
         throttle = self.state[:, Row.THROTTLE, :1]
         correction = self._correct(torch.rad2deg(body_rates.to(self.state)), throttle)
-        self._feel_throttle(throttle)
+        self._update_anti_gravity(throttle)
         return self._mix(correction / 1000.0, throttle)
 
     def _lowpass(self, row: Row, value: Tensor, gain: Tensor | float) -> Tensor:
@@ -185,8 +185,8 @@ class RateLoop:
 
     def _correct(self, gyro: Tensor, throttle: Tensor) -> Tensor:
         """Return P + I + D (N, 3), in thousandths of the motors' range."""
-        p, own, dt = self.parameters, self.own, self.dt
-        filters = own[:, Own.FILTERS]
+        p, own, dt = self.parameters, self.drone_parameters, self.dt
+        filters = own[:, DroneParameter.FILTERS]
         gyro = self._lowpass(Row.GYRO_LPF2, gyro, lowpass_gain(p.gyro_lpf2 * filters[:, :1], dt))
         cutoff = dynamic_cutoff(p.gyro_lpf1, p.lpf_expo, throttle) * filters[:, :1]
         gyro = self._lowpass(Row.GYRO_LPF1, gyro, lowpass_gain(cutoff, dt))
@@ -200,10 +200,10 @@ class RateLoop:
         moving = (setpoint - self._lowpass(Row.RELAX, setpoint, lowpass_gain(p.iterm_relax_cutoff, dt))).abs()
         relax = (1.0 - self.level * moving / p.iterm_relax_threshold).clamp(min=0.0)
         lift = p.anti_gravity_gain * self.state[:, Row.ANTI_GRAVITY, 1:2]  # (N, 1)
-        proportional = self._lowpass(Row.P, self.p * own[:, Own.P] * error, self.p_gain)
+        proportional = self._lowpass(Row.P, self.p * own[:, DroneParameter.P] * error, self.p_gain)
         calm = (setpoint.abs() / 50.0).clamp(min=1.0)
         proportional = proportional * (1.0 + self.level * lift / calm * betaflight.ANTI_GRAVITY_P)
-        gain = self.i * own[:, Own.I] + self.level * lift * betaflight.ANTI_GRAVITY_I
+        gain = self.i * own[:, DroneParameter.I] + self.level * lift * betaflight.ANTI_GRAVITY_I
         integral = self.state[:, Row.I] + gain * dt * relax * error
         limit = p.iterm_windup * self.sum_limit
         self.state[:, Row.I] = integral = torch.minimum(torch.maximum(integral, -limit), limit)
@@ -214,18 +214,18 @@ class RateLoop:
         rise = 1.0 + torch.minimum(boost, self.d_rise)
         excess = (throttle - p.tpa_breakpoint).clamp(min=0.0)
         attenuation = 1.0 - p.tpa_rate / (1.0 - p.tpa_breakpoint) * excess
-        derivative = self.d * own[:, Own.D] * (before - slow) / dt * rise * attenuation
+        derivative = self.d * own[:, DroneParameter.D] * (before - slow) / dt * rise * attenuation
         total = proportional + integral + derivative
         return torch.minimum(torch.maximum(total, -self.sum_limit), self.sum_limit)
 
-    def _feel_throttle(self, throttle: Tensor) -> None:
+    def _update_anti_gravity(self, throttle: Tensor) -> None:
         """Low-pass the throttle's changes for anti-gravity, weighted more at low and at falling throttle (N, 1)."""
         p, state = self.parameters, self.state
         low = 1.0 - throttle
         change = throttle - state[:, Row.THROTTLE, 1:2]
-        felt = change.abs() / self.dt * low * low * torch.where(change > 0.0, 0.5 * low, 1.0)
+        weighted_change = change.abs() / self.dt * low * low * torch.where(change > 0.0, 0.5 * low, 1.0)
         gain = lowpass_gain(p.anti_gravity_cutoff * betaflight.PT2_CORRECTION, self.dt)
-        first = state[:, Row.ANTI_GRAVITY, :1] + gain * (felt - state[:, Row.ANTI_GRAVITY, :1])
+        first = state[:, Row.ANTI_GRAVITY, :1] + gain * (weighted_change - state[:, Row.ANTI_GRAVITY, :1])
         second = state[:, Row.ANTI_GRAVITY, 1:2] + gain * (first - state[:, Row.ANTI_GRAVITY, 1:2])
         state[:, Row.ANTI_GRAVITY, :1], state[:, Row.ANTI_GRAVITY, 1:2] = first, second
         state[:, Row.THROTTLE, 1:2] = throttle.clone()

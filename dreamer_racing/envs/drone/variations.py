@@ -22,7 +22,7 @@ from dreamer_racing.settings import quoted, suggestion
 T = TypeVar("T")
 SUFFIXES = (".yaml", ".yml")
 """File name suffixes of drone files."""
-KEPT = "randomisation"
+UNCHANGED_FIELD = "randomisation"
 """Field that a drone file does not change."""
 
 
@@ -32,7 +32,7 @@ def write_variation(path: Path, preset: str, changes: Mapping[str, Any], about: 
     Args:
         path: The file; an existing one is replaced.
         preset: The preset that the drone varies.
-        changes: The changed fields, as returned by `differing`.
+        changes: The changed fields, as returned by `field_differences`.
         about: Sources of its numbers, plain values.
     """
     content = {"preset": preset, "parameters": dict(changes), "about": dict(about)}
@@ -40,15 +40,15 @@ def write_variation(path: Path, preset: str, changes: Mapping[str, Any], about: 
     path.write_text(yaml.safe_dump(content, sort_keys=False, default_flow_style=None, width=100), encoding="utf-8")
 
 
-def differing(base: Any, changed: Any) -> dict[str, Any]:
+def field_differences(base: Any, changed: Any) -> dict[str, Any]:
     """Return the fields in which one dataclass differs from another, as plain values."""
     fields = {}
     for name in (field.name for field in dataclasses.fields(base)):
         before, now = getattr(base, name), getattr(changed, name)
-        if before == now or name == KEPT:
+        if before == now or name == UNCHANGED_FIELD:
             continue
         inner = dataclasses.is_dataclass(before) and dataclasses.is_dataclass(now)
-        fields[name] = differing(before, now) if inner else list(now) if isinstance(now, tuple) else now
+        fields[name] = field_differences(before, now) if inner else list(now) if isinstance(now, tuple) else now
     return fields
 
 
@@ -70,13 +70,13 @@ def read_variation(path: Path) -> tuple[Any, dict[str, Any]]:
     return content.get("preset"), changes
 
 
-def vary(base: T, changes: Mapping[str, Any]) -> T:
+def apply_changes(base: T, changes: Mapping[str, Any]) -> T:
     """Return a copy of a dataclass with changed fields; lists become tuples.
 
     Raises:
         ValueError: A field does not exist, or a value is not allowed.
     """
-    names = sorted({field.name for field in dataclasses.fields(base)} - {KEPT})  # type: ignore[arg-type]  # a dataclass, of any kind
+    names = sorted({field.name for field in dataclasses.fields(base)} - {UNCHANGED_FIELD})  # type: ignore[arg-type]  # a dataclass, of any kind
     values: dict[str, Any] = {}
     for name, value in changes.items():
         if name not in names:
@@ -85,7 +85,7 @@ def vary(base: T, changes: Mapping[str, Any]) -> T:
         if isinstance(value, dict):
             if not dataclasses.is_dataclass(before):
                 raise ValueError(f"{name}={quoted(value)}: is no group of numbers.")
-            values[name] = vary(before, value)
+            values[name] = apply_changes(before, value)
         else:
             values[name] = tuple(value) if isinstance(value, list) else value
     return dataclasses.replace(base, **values)  # type: ignore[type-var]  # likewise

@@ -18,7 +18,7 @@ from dreamer_racing.envs.worlds import RaceWorlds
 
 
 @dataclass(frozen=True)
-class FlownLaps:
+class PilotStatistics:
     """Statistics of N episodes."""
 
     gates: Tensor  # (N,) int64, passed
@@ -31,7 +31,7 @@ class FlownLaps:
     gate_in_view: Tensor  # (N,) fraction of time with the target gate's centre in the nose camera's image
 
 
-def fly_laps(
+def evaluate_pilot(
     track: str | Track,
     preset: str | QuadrotorParameters = "easy",
     num_envs: int = 1,
@@ -42,7 +42,7 @@ def fly_laps(
     random_starts: bool = False,
     seed: int = 0,
     episode_steps: int | None = None,
-) -> FlownLaps:
+) -> PilotStatistics:
     """Fly N complete episodes and return their statistics.
 
     Args:
@@ -105,7 +105,7 @@ def _in_view(worlds: RaceWorlds, position: Tensor, attitude: Tensor) -> Tensor:
     return is_in_view(seen, worlds.camera).squeeze(1)
 
 
-def _summarise(steps: list[_Step], num_gates: int, laps: int) -> FlownLaps:
+def _summarise(steps: list[_Step], num_gates: int, laps: int) -> PilotStatistics:
     """Compute the statistics of a flight from its control steps."""
     flew = torch.stack([step.flew for step in steps])  # (T, N)
     time = flew.sum(0)
@@ -117,7 +117,7 @@ def _summarise(steps: list[_Step], num_gates: int, laps: int) -> FlownLaps:
     gates, lap_time = outcomes("gates_passed"), outcomes("lap_time")
     at_lap = (gates // num_gates).unsqueeze(-1)  # (T, N, 1)
     lap_times = (lap_time.unsqueeze(-1) * (at_lap == torch.arange(1, laps + 1, device=speed.device))).amax(0)  # (N, L)
-    return FlownLaps(
+    return PilotStatistics(
         gates=gates.amax(0),
         finished=outcomes("finished").any(0),
         crash=outcomes("crash").amax(0),

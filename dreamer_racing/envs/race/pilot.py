@@ -74,7 +74,7 @@ class ScriptedPilot:
 
     WINDOW = 0.25  # s: the line is searched from this long before the last gate to this long after the target gate
     SEARCH_DT = 0.02  # s between the points of the search
-    JUMP = 0.3  # m of displacement beyond the drone's own motion that indicates a reset
+    RESET_JUMP = 0.3  # m of displacement beyond the drone's own motion that indicates a reset
 
     def __init__(
         self,
@@ -138,7 +138,7 @@ class ScriptedPilot:
         """
         inputs = (position, attitude, linear_velocity, body_rates)
         state = [value.to(self._device, self._dtype) for value in inputs]
-        self._remember(*state)
+        self._update_estimates(*state)
         position, attitude, velocity, body_rates = self._predict(*state)
         time = self._find(position, target_gate.to(self._device))
         reference = self.line.at(time)
@@ -150,7 +150,7 @@ class ScriptedPilot:
         thrust = thrust / self._thrust_scale / self.parameters.collective_thrust_scale - 1.0
         return torch.cat((thrust, rates / self._rate_max), dim=1).clamp(-1.0, 1.0)
 
-    def _remember(self, position: Tensor, attitude: Tensor, velocity: Tensor, body_rates: Tensor) -> None:
+    def _update_estimates(self, position: Tensor, attitude: Tensor, velocity: Tensor, body_rates: Tensor) -> None:
         """Reset the memory of drones that jumped, and update the thrust scale estimate of the others."""
         dt, dynamics = self.parameters.control_dt, self._dynamics
         if self._last_position is None or len(self._last_position) != len(position):
@@ -158,9 +158,9 @@ class ScriptedPilot:
             self._last_command = torch.zeros_like(attitude)
             self._last_thrust, self._thrust_scale = torch.zeros_like(position[:, :1]), torch.ones_like(position[:, :1])
         velocity_mean = (velocity + self._last_velocity) / 2.0
-        surprise = (position - self._last_position - dt * velocity_mean).norm(dim=-1, keepdim=True)
-        new = ~(surprise < self.JUMP)  # NaN is new too
-        hover = torch.nn.functional.pad(torch.full_like(surprise, GRAVITY), (0, 3))
+        displacement_error = (position - self._last_position - dt * velocity_mean).norm(dim=-1, keepdim=True)
+        new = ~(displacement_error < self.RESET_JUMP)  # NaN is new too
+        hover = torch.nn.functional.pad(torch.full_like(displacement_error, GRAVITY), (0, 3))
         self._last_command = torch.where(new, hover, self._last_command)
         lag = self.parameters.motor_time_constant + self.parameters.command_delay
         thrust = torch.lerp(self._last_thrust, self._last_command[:, :1], min(1.0, dt / lag))

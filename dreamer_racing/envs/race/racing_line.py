@@ -142,7 +142,7 @@ class LineNodes:
         self._start = torch.nn.functional.pad(torch.cat(arcs), (0, 0, 0, 2))  # (M, 4, 3)
         self._start_duration = lengths / self.START_SPEED / self._counts  # (G,) s per segment
         self._scales = torch.tensor(self.SCALES, dtype=dtype).view(4, 1)
-        self.change = torch.zeros_like(self._start, requires_grad=True)  # (M, 4, 3)
+        self.offsets = torch.zeros_like(self._start, requires_grad=True)  # (M, 4, 3)
         self.log_duration = torch.zeros_like(self._start_duration, requires_grad=True)  # (G,)
 
     def _arc(self, gate: int, length: float, count: int) -> Tensor:
@@ -154,15 +154,15 @@ class LineNodes:
         slope = 6 * (t - t**2) * gap + (3 * t**2 - 4 * t + 1) * out + (3 * t**2 - 2 * t) * into
         return torch.stack((position, self.START_SPEED * torch.nn.functional.normalize(slope, dim=-1)), dim=1)
 
-    def free_numbers(self) -> np.ndarray:
+    def variables(self) -> np.ndarray:
         """Return the optimisation variables as one vector, for `restore`."""
-        return torch.cat((self.change.flatten(), self.log_duration)).detach().numpy()
+        return torch.cat((self.offsets.flatten(), self.log_duration)).detach().numpy()
 
     def restore(self, numbers: Tensor) -> None:
-        """Set the optimisation variables to a result of `free_numbers`."""
-        change, log_duration = numbers.tensor_split([self.change.numel()])
+        """Set the optimisation variables to a result of `variables`."""
+        offsets, log_duration = numbers.tensor_split([self.offsets.numel()])
         with torch.no_grad():
-            self.change.copy_(change.view_as(self.change))
+            self.offsets.copy_(offsets.view_as(self.offsets))
             self.log_duration.copy_(log_duration)
 
     def durations(self) -> Tensor:
@@ -171,8 +171,8 @@ class LineNodes:
 
     def nodes(self) -> Tensor:
         """Return position, velocity, acceleration and jerk of each node (M, 4, 3)."""
-        nodes = self._start + self._scales * self.change
-        left, up = (self.gate_offset * self.change[self.gate_nodes, 0, :2].tanh()).unsqueeze(-1).unbind(1)
+        nodes = self._start + self._scales * self.offsets
+        left, up = (self.gate_offset * self.offsets[self.gate_nodes, 0, :2].tanh()).unsqueeze(-1).unbind(1)
         at_gates = self.gates + left * self.left + torch.nn.functional.pad(up, (2, 0))
         rows = torch.cat((at_gates.unsqueeze(1), nodes[self.gate_nodes, 1:]), dim=1)
         return nodes.index_copy(0, self.gate_nodes, rows)
@@ -305,13 +305,13 @@ def store_lines() -> None:
                 if (key := line_key(track, drone, limits)) not in lines:
                     nodes = LineNodes(track, limits.gate_offset)
                     search_line(nodes, track, Dynamics(drone), limits)
-                    lines[key] = nodes.free_numbers()
+                    lines[key] = nodes.variables()
     np.savez_compressed(STORED, **lines)
 
 
 def _descend(nodes: LineNodes, cost: Callable[[], Tensor]) -> None:
     """Minimise the cost: Adam first brings the line near the limits, then L-BFGS makes it fast."""
-    variables = [nodes.change, nodes.log_duration]
+    variables = [nodes.offsets, nodes.log_duration]
 
     def evaluate() -> Tensor:
         with torch.enable_grad():

@@ -87,7 +87,7 @@ class Simulator(ABC):
         self.quadrotor.command(action)
         return self._flight.fly()
 
-    def feel(self) -> Tensor:
+    def ideal_imu(self) -> Tensor:
         """Return ideal gyro and accelerometer measurements of each drone: body rates and specific force (N, 6).
 
         At its centre, in rad/s and m/s², body frame; the specific force is (0, 0, 9.81) at rest. It is that of the last

@@ -18,7 +18,7 @@ from torch import Tensor
 
 from dreamer_racing.envs.drone.parameters import GRAVITY, ROTOR_SPINS
 from dreamer_racing.envs.drone.quadrotor import Quadrotor
-from dreamer_racing.envs.drone.rate_loop import Own
+from dreamer_racing.envs.drone.rate_loop import DroneParameter
 from dreamer_racing.envs.simulator import fused_rate_loop
 from dreamer_racing.envs.simulator.warp_device import load_warp, scope
 
@@ -27,14 +27,14 @@ class Kernels(NamedTuple):
     """The kernels of one floating-point type.
 
     Attributes:
-        push: Runs controller and motors for a physics step; writes the force and torque that MuJoCo applies.
-        settle: Corrects MuJoCo's Euler step and stores the resulting position.
+        apply_controls: Runs controller and motors for a physics step; writes the force and torque that MuJoCo applies.
+        correct_step: Corrects MuJoCo's Euler step and stores the resulting position.
         constants: The struct of the constants common to all drones.
         firmware: The struct in it of the flight controllers' constants.
     """
 
-    push: Any
-    settle: Any
+    apply_controls: Any
+    correct_step: Any
     constants: Any
     firmware: Any
 
@@ -70,14 +70,14 @@ class FusedFlight:
         force, saved, path = (warp.from_torch(tensor) for tensor in (qfrc_applied, before, self._path))
         effort = warp.from_torch(quadrotor.effort)
         with scope(self._device):
-            self._push, self._settle = (
+            self._apply_controls, self._correct_step = (
                 [
                     warp.launch(kernel, num_drones, inputs=[index, constants, *inputs], record_cmd=True)
                     for index in range(steps)
                 ]
                 for kernel, inputs in (
-                    (kernels.push, [*arrays, *own, effort, force, saved]),
-                    (kernels.settle, [*arrays[:2], saved, path]),
+                    (kernels.apply_controls, [*arrays, *own, effort, force, saved]),
+                    (kernels.correct_step, [*arrays[:2], saved, path]),
                 )
             )
 
@@ -85,16 +85,16 @@ class FusedFlight:
         """Simulate one control step with the current command; return the positions (P + 1, N, 3)."""
         self._path[0] = self._position
         with scope(self._device):
-            for index in range(len(self._push)):
+            for index in range(len(self._apply_controls)):
                 self.step(index)
         return self._path.clone()
 
     def step(self, physics_step: int) -> None:
         """Simulate one physics step, given its index in the control step; a larger index is taken as the last."""
-        index = min(physics_step, len(self._push) - 1)
-        self._push[index].launch()
+        index = min(physics_step, len(self._apply_controls) - 1)
+        self._apply_controls[index].launch()
         self._integrate()
-        self._settle[index].launch()
+        self._correct_step[index].launch()
 
 
 def _constants(quadrotor: Quadrotor, struct: Any) -> Any:
@@ -129,7 +129,7 @@ def make_kernels(dtype: torch.dtype) -> Kernels:
     vec3, vec4 = wp.types.vector(3, real), wp.types.vector(4, real)
     rate_loop = fused_rate_loop.make_kernels(dtype)
     Firmware, motor_commands = rate_loop.firmware, rate_loop.motor_commands
-    motors_row = int(Own.MOTORS)
+    motors_row = int(DroneParameter.MOTORS)
 
     @wp.struct
     class Constants:
@@ -196,7 +196,7 @@ def make_kernels(dtype: torch.dtype) -> Kernels:
         return thrusts
 
     @wp.func
-    def note_effort(c: Constants, i: int, step: int, asked: real, target: vec4, effort: wp.array2d(dtype=real)):
+    def accumulate_effort(c: Constants, i: int, step: int, asked: real, target: vec4, effort: wp.array2d(dtype=real)):
         share = real(1.0) / real(c.physics_steps)
         at_limit = real(0.0)
         if wp.min(target) <= c.low + real(1.0e-6) or wp.max(target) >= c.limit - real(1.0e-6):
@@ -233,18 +233,20 @@ def make_kernels(dtype: torch.dtype) -> Kernels:
 
     # the wrench that gives the nominal body the acceleration of the randomised drone
     @wp.func
-    def own_force(c: Constants, thrust: vec3, velocity: vec3, rates: vec3, gravity: vec3, mass: real, drag: real):
+    def randomised_force(
+        c: Constants, thrust: vec3, velocity: vec3, rates: vec3, gravity: vec3, mass: real, drag: real
+    ):
         now = (thrust - drag * wp.cw_mul(c.drag, velocity)) / mass
         middle = velocity + c.half_step * (now / c.mass + gravity - wp.cross(rates, velocity))
         return (thrust - drag * wp.cw_mul(c.drag, middle)) / mass
 
     @wp.func
-    def own_torque(c: Constants, torque: vec3, rates: vec3, factors: vec3):
+    def randomised_torque(c: Constants, torque: vec3, rates: vec3, factors: vec3):
         own_gyroscopic = wp.cross(rates, wp.cw_mul(wp.cw_mul(factors, c.inertia), rates))
         return wp.cw_div(torque - own_gyroscopic, factors) + gyroscopic(c, rates)
 
     @wp.kernel(module="unique", enable_backward=False)
-    def push(
+    def apply_controls(
         physics_step: int,
         c: Constants,
         qpos: wp.array2d(dtype=real),
@@ -281,7 +283,7 @@ def make_kernels(dtype: torch.dtype) -> Kernels:
             middle_rates = half_a_step_later(c, rates, torque_of(c, wp.cw_mul(speed, speed)))
             torque = gyroscopic(c, middle_rates) + c.rate_gain * wp.cw_mul(c.inertia, wanted - middle_rates)
             target = mix(c, setpoints[age, i, 0], torque)
-        note_effort(c, i, physics_step, setpoints[age, i, 0], target, effort)
+        accumulate_effort(c, i, physics_step, setpoints[age, i, 0], target, effort)
         thrusts = turn_rotors(c, i, target, speed, decay, decay_half, rotor_speed)
         load = real(0.25) * (thrusts[0] + thrusts[1] + thrusts[2] + thrusts[3]) / c.limit
         thrusts = (real(1.0) - sag * load) * thrusts
@@ -290,9 +292,9 @@ def make_kernels(dtype: torch.dtype) -> Kernels:
 
         if c.perturbed != 0:
             velocity, gravity = rotate(w, -v, vec3(qvel[i, 0], qvel[i, 1], qvel[i, 2])), rotate(w, -v, c.gravity)
-            force = own_force(c, thrust_factor[i, 0] * force, velocity, rates, gravity, mass[i, 0], drag[i, 0])
+            force = randomised_force(c, thrust_factor[i, 0] * force, velocity, rates, gravity, mass[i, 0], drag[i, 0])
             torque = thrust_factor[i, 0] * vec3(torque[0], torque[1], torque_factor[i, 0] * torque[2])
-            torque = own_torque(c, torque, rates, vec3(inertia[i, 0], inertia[i, 1], inertia[i, 2]))
+            torque = randomised_torque(c, torque, rates, vec3(inertia[i, 0], inertia[i, 1], inertia[i, 2]))
 
         # rotate the force to its mid-step direction, and correct the torque for the mid-step gyroscopic torque
         middle_rates = half_a_step_later(c, rates, torque)
@@ -306,7 +308,7 @@ def make_kernels(dtype: torch.dtype) -> Kernels:
             before[i, axis] = qvel[i, axis]
 
     @wp.kernel(module="unique", enable_backward=False)
-    def settle(
+    def correct_step(
         physics_step: int,
         c: Constants,
         qpos: wp.array2d(dtype=real),
@@ -329,4 +331,4 @@ def make_kernels(dtype: torch.dtype) -> Kernels:
         for axis in range(3):
             path[physics_step + 1, i, axis] = qpos[i, axis]
 
-    return Kernels(push, settle, Constants, Firmware)
+    return Kernels(apply_controls, correct_step, Constants, Firmware)

@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from dreamer_racing.envs.drone import betaflight
-from dreamer_racing.envs.drone.rate_loop import Own, RateLoop, Row, lowpass_gain
+from dreamer_racing.envs.drone.rate_loop import DroneParameter, RateLoop, Row, lowpass_gain
 from dreamer_racing.envs.simulator.warp_device import load_warp
 
 
@@ -33,7 +33,7 @@ def arrays(rate_loop: RateLoop | None, like: Tensor) -> list[Any]:
     """Return a rate loop's state and per-drone parameters as warp arrays; two dummy arrays if there is none."""
     warp = load_warp()
     none = like.new_zeros(1, 1, 3)
-    tensors = (none, none) if rate_loop is None else (rate_loop.state, rate_loop.own)
+    tensors = (none, none) if rate_loop is None else (rate_loop.state, rate_loop.drone_parameters)
     row = warp.types.vector(3, warp.dtype_from_torch(like.dtype))
     return [warp.from_torch(tensor, dtype=row) for tensor in tensors]
 
@@ -238,11 +238,12 @@ def make_kernels(dtype: torch.dtype) -> Kernels:
 
 
 DEGREES = 57.29577951308232  # per radian
-# rows of `Row` and `Own` as plain integers, which warp's compiler needs
+# rows of `Row` and `DroneParameter` as plain integers, which warp's compiler needs
 SETPOINT, SETPOINT_SPEED, SETPOINT_MEAN = int(Row.SETPOINT), int(Row.SETPOINT_SPEED), int(Row.SETPOINT_MEAN)
 GYRO_LPF2, GYRO_LPF1 = int(Row.GYRO_LPF2), int(Row.GYRO_LPF1)
 DTERM_LPF1, DTERM_LPF2 = int(Row.DTERM_LPF1), int(Row.DTERM_LPF2)
 PROPORTIONAL, RELAX, INTEGRAL = int(Row.P), int(Row.RELAX), int(Row.I)
 BOOST_1, BOOST_2 = int(Row.BOOST_1), int(Row.BOOST_2)
 THROTTLE, ANTI_GRAVITY = int(Row.THROTTLE), int(Row.ANTI_GRAVITY)
-OWN_P, OWN_I, OWN_D, OWN_FILTERS = int(Own.P), int(Own.I), int(Own.D), int(Own.FILTERS)
+OWN_P, OWN_I, OWN_D = int(DroneParameter.P), int(DroneParameter.I), int(DroneParameter.D)
+OWN_FILTERS = int(DroneParameter.FILTERS)

@@ -13,7 +13,7 @@ from typing import Any
 import mujoco
 import numpy as np
 
-from dreamer_racing.envs.gl_variables import in_the_way
+from dreamer_racing.envs.gl_variables import describe_conflicts
 from dreamer_racing.envs.simulator.scene import CAMERA_NAME, HALL_GROUP, Camera
 
 MAX_GEOMS = 1000  # capacity of MuJoCo's list of visible geoms
@@ -80,7 +80,7 @@ class OpenGLScene:
         mujoco.mjr_readPixels(self._buffer, None, self._viewport, self._context)
         out[:] = self._upright
 
-    def dress(self, colors: np.ndarray, field_of_view: float) -> None:
+    def set_looks(self, colors: np.ndarray, field_of_view: float) -> None:
         """Set the colours of the scene's materials (K, 3), and the camera's vertical field of view, degrees."""
         for geom in self._scene.geoms[: self._scene.ngeom]:
             geom.rgba[:3] = colors[geom.matid]
@@ -106,7 +106,7 @@ def open_scene(backend: str, model: mujoco.MjModel, camera: Camera) -> OpenGLSce
     try:
         return OpenGLScene(backend, model, camera)
     except Exception as error:  # PyOpenGL raises anything from AttributeError to GLError
-        reason = f"{backend} did not start ({type(error).__name__}: {error}){in_the_way(backend)}."
+        reason = f"{backend} did not start ({type(error).__name__}: {error}){describe_conflicts(backend)}."
         raise RendererUnavailableError(reason) from error
 
 

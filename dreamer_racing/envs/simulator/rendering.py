@@ -47,7 +47,7 @@ logger = logging.getLogger(__name__)
 T = TypeVar("T")
 
 RENDERERS = ("egl", "osmesa", "warp")
-HYBRID = "warp_cuda"
+WARP_CUDA = "warp_cuda"
 EXIT_PATIENCE = 10.0
 """Maximum time for which the exit of the process waits for a frame that is being rendered, s [choice]."""
 
@@ -181,7 +181,7 @@ class Renderer:
     A renderer that is garbage-collected without `close` frees its workers too, without waiting.
 
     Args:
-        name: a name from `RENDERERS`, or `HYBRID`.
+        name: a name from `RENDERERS`, or `WARP_CUDA`.
         make_worker: makes one worker; called once in each thread.
         camera: the nose camera.
         num_workers: K.
@@ -256,7 +256,7 @@ class OpenGLWorker:
         images = out.numpy()
         for index in range(len(images)):
             if looks is not None:
-                self._scene.dress(looks.colors[index].numpy(), looks.field_of_view[index].item())
+                self._scene.set_looks(looks.colors[index].numpy(), looks.field_of_view[index].item())
             self._scene.draw(positions[index], ups[index], forwards[index], images[index])
 
     def close(self) -> None:
@@ -270,7 +270,7 @@ def make_renderer(
     """Make a renderer by name, or the first that works for `auto`; log which one and why.
 
     Args:
-        name: `auto`, or a name from `RENDERERS`, or `HYBRID`.
+        name: `auto`, or a name from `RENDERERS`, or `WARP_CUDA`.
         model: the compiled scene.
         camera: the nose camera.
         num_envs: maximum number of frames per call.
@@ -281,10 +281,10 @@ def make_renderer(
         ValueError: unknown name.
         RendererUnavailableError: the chosen renderer does not work here.
     """
-    if name not in ("auto", *RENDERERS, HYBRID):
-        known = ", ".join(("auto", *RENDERERS, HYBRID))
+    if name not in ("auto", *RENDERERS, WARP_CUDA):
+        known = ", ".join(("auto", *RENDERERS, WARP_CUDA))
         raise ValueError(f"Unknown renderer {name!r}: use {known}, or None for no images.")
-    if name == HYBRID:
+    if name == WARP_CUDA:
         num_workers = 1
     reasons = []
     for candidate in RENDERERS if name == "auto" else (name,):
@@ -296,13 +296,13 @@ def make_renderer(
             continue
         why = f"; {' '.join(reasons)}" if reasons else ""
         level = logging.WARNING if reasons else logging.INFO  # a fallback is slower
-        say_once(level, f"renderer: {candidate}, {num_workers} thread(s){why}")
+        log_once(level, f"renderer: {candidate}, {num_workers} thread(s){why}")
         return renderer
     raise RendererUnavailableError(" ".join(reasons))
 
 
 @cache
-def say_once(level: int, words: str) -> None:
+def log_once(level: int, words: str) -> None:
     """Log a message once per process, not again for each further simulator."""
     logger.log(level, words)
 
@@ -316,7 +316,7 @@ def _worker_factory(
         return lambda: OpenGLWorker(name, model, camera)
     if name == "warp":
         return lambda: RayCaster(model, camera, frames, "cpu", varied_looks)
-    if name == HYBRID:
+    if name == WARP_CUDA:
         if not torch.cuda.is_available():
             raise RendererUnavailableError(f"{name} needs a CUDA device, and torch {torch.__version__} finds none.")
         return lambda: RayCaster(model, camera, frames, "cuda", varied_looks)

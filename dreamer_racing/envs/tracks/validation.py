@@ -37,13 +37,13 @@ START_CLEARANCE = 0.3
 GATE_CLEARANCE = 1.0
 """Minimum distance (m) of a start from a gate's plane: training noise moves a start by at most 0.71 m [choice]."""
 
-FARTHEST = 1000.0
+MAX_COORDINATE = 1000.0
 """Largest coordinate (m), at which float32 still resolves 0.1 mm [choice]."""
 
 FARTHEST_LEG = 540.0
 """Largest distance (m) from one gate to the next: a whole evaluation, 30 s, at 18 m/s [choice]."""
 
-SMALLEST = 0.01
+MIN_DIMENSION = 0.01
 """Minimum opening, depth and frame width of a gate (m) [choice]."""
 
 MAX_GATES, MAX_LAPS = 200, 1000
@@ -104,8 +104,8 @@ def _check_numbers(track: Track, source: str) -> None:
     }
     for field, vector in vectors.items():
         require_vector(source, field, vector)
-        if max(map(abs, vector)) > FARTHEST:
-            raise refusal(source, field, vector, f"within {FARTHEST:.0f} m of the origin on every axis")
+        if max(map(abs, vector)) > MAX_COORDINATE:
+            raise refusal(source, field, vector, f"within {MAX_COORDINATE:.0f} m of the origin on every axis")
     for name, gate in _named_gates(track):
         if gate.color is not None and not _is_color(gate.color):
             raise refusal(source, f"{name}.color", gate.color, "three numbers [red, green, blue] from 0 to 1, or None")
@@ -133,15 +133,15 @@ def _check_kinds(track: Track, source: str) -> None:
 
 def _check_shape(shape: GateShape, source: str) -> None:
     """Refuse gates whose opening, frame, depth or margin is out of range."""
-    if shape.opening < SMALLEST:
-        raise refusal(source, "shape.opening", shape.opening, f"greater than 0 m, {SMALLEST} m at least")
-    if shape.outer <= shape.opening + 2 * SMALLEST - ROUNDING:
-        allowed = f"greater than shape.opening, which is {shape.opening} m, by {2 * SMALLEST} m at least"
+    if shape.opening < MIN_DIMENSION:
+        raise refusal(source, "shape.opening", shape.opening, f"greater than 0 m, {MIN_DIMENSION} m at least")
+    if shape.outer <= shape.opening + 2 * MIN_DIMENSION - ROUNDING:
+        allowed = f"greater than shape.opening, which is {shape.opening} m, by {2 * MIN_DIMENSION} m at least"
         raise refusal(source, "shape.outer", shape.outer, allowed)
-    if shape.outer > FARTHEST:
-        raise refusal(source, "shape.outer", shape.outer, f"at most {FARTHEST:.0f} m")
-    if shape.depth < SMALLEST:
-        raise refusal(source, "shape.depth", shape.depth, f"greater than 0 m, {SMALLEST} m at least")
+    if shape.outer > MAX_COORDINATE:
+        raise refusal(source, "shape.outer", shape.outer, f"at most {MAX_COORDINATE:.0f} m")
+    if shape.depth < MIN_DIMENSION:
+        raise refusal(source, "shape.depth", shape.depth, f"greater than 0 m, {MIN_DIMENSION} m at least")
     if not 0 <= shape.margin < shape.opening / 2:
         allowed = f"from 0 to less than half of shape.opening, which is {shape.opening / 2} m"
         raise refusal(source, "shape.margin", shape.margin, allowed)

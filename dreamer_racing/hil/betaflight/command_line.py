@@ -40,7 +40,7 @@ class CommandLine:
                 if time.monotonic() > deadline:
                     raise  # else try again: a ``#`` sent while the firmware boots is lost
 
-    def say(self, line: str) -> str:
+    def execute(self, line: str) -> str:
         """Type a line; return the answer, without echo and prompt.
 
         Raises:
@@ -57,7 +57,7 @@ class CommandLine:
         """
         refused = {}
         for line in lines:
-            if line and not line.startswith("#") and (found := _REFUSED.search(self.say(line))):
+            if line and not line.startswith("#") and (found := _REFUSED.search(self.execute(line))):
                 refused[line] = found[0].strip("# ")
         return refused
 

@@ -188,10 +188,10 @@ class Firmware:
             self.check()
             raise
         try:
-            found = _RELEASE.search(line.say("version"))
+            found = _RELEASE.search(line.execute("version"))
             self.release = found[1] if found else "unknown"
             self.refused = line.type_all(lines)
-            self.dump = line.say("dump all")
+            self.dump = line.execute("dump all")
             line.leave("save")
             if self._process is not None:
                 self._process.wait(_STOPS_WITHIN)

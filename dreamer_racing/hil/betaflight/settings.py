@@ -30,7 +30,7 @@ _NO_DUMP = (
 )
 
 
-class Wanted(NamedTuple):
+class Setting(NamedTuple):
     """A required setting.
 
     Args:
@@ -72,7 +72,7 @@ class Status(enum.Enum):
 class Finding(NamedTuple):
     """A compared setting: the required one, the result, and the value found (None: unknown)."""
 
-    wanted: Wanted
+    wanted: Setting
     status: Status
     found: str | None
 
@@ -96,7 +96,7 @@ def rate_map(contract: dict[str, Any]) -> RateMap:
     return RateMap(**{axis: steps * _STEP for axis, steps in _rate_steps(contract).items()})
 
 
-def wanted_settings(contract: dict[str, Any], link: str) -> list[Wanted]:
+def wanted_settings(contract: dict[str, Any], link: str) -> list[Setting]:
     """Return all settings that an actor needs, in the order in which to type them.
 
     Args:
@@ -217,7 +217,7 @@ def _read_modes(modes: list[list[str]]) -> dict[str, str]:
     }
 
 
-def _receiver(link: str) -> list[Wanted]:
+def _receiver(link: str) -> list[Setting]:
     """Return the settings by which the flight controller listens to a link."""
     if link not in LINKS:
         raise ValueError(f"link={link}: must be one of {', '.join(LINKS)}.")
@@ -228,28 +228,28 @@ def _receiver(link: str) -> list[Wanted]:
     serial = link != "msp"
     alone = "" if serial else "; nobody else can take over, so for the bench or a cage"
     # a firmware built without one of these features has it off
-    rx_serial = Wanted(
+    rx_serial = Setting(
         "feature RX_SERIAL",
         "ON" if serial else "OFF",
         "a receiver at a UART: see the Ports tab",
         "ON",
         absent=not serial,
     )
-    rx_msp = Wanted(
+    rx_msp = Setting(
         "feature RX_MSP", "OFF" if serial else "ON", f"MSP as the only receiver{alone}", "OFF", absent=serial
     )
     if not serial:
         return [rx_serial, rx_msp, _MSP_RATE]
     # The one that is off comes first: the firmware keeps one receiver, not always the last set.
-    return [rx_msp, rx_serial, Wanted("serialrx_provider", link.upper(), "the protocol of the link")]
+    return [rx_msp, rx_serial, Setting("serialrx_provider", link.upper(), "the protocol of the link")]
 
 
-def _switches(link: str) -> tuple[Wanted, ...]:
+def _switches(link: str) -> tuple[Setting, ...]:
     """Return the settings of the switches for arming and flight modes."""
     return _BY_PILOT if link == "msp_override" else _BY_LINK
 
 
-def _rates(contract: dict[str, Any]) -> list[Wanted]:
+def _rates(contract: dict[str, Any]) -> list[Setting]:
     """Return the settings that make body rates linear in the sticks, and leave the throttle unchanged."""
     wanted = [("rates_type", "ACTUAL", "rates in units of 10 deg/s", "ACTUAL")]
     for axis, steps in _rate_steps(contract).items():
@@ -265,7 +265,7 @@ def _rates(contract: dict[str, Any]) -> list[Wanted]:
         ("thr_expo", "0", "no curve", "0"),
         ("throttle_limit_type", "OFF", "full throttle must be full thrust", "OFF"),
     ]
-    return [Wanted(*each, section="rateprofile") for each in wanted]
+    return [Setting(*each, section="rateprofile") for each in wanted]
 
 
 def _rate_steps(contract: dict[str, Any]) -> dict[str, int]:
@@ -289,59 +289,60 @@ def _asked_rates(contract: dict[str, Any]) -> dict[str, float]:
     return {axis: abs(channels[name]["offset"]) + abs(channels[name]["scale"]) for axis, name in AXES.items()}
 
 
-_MSP_RATE = Wanted(
+_MSP_RATE = Setting(
     "serial_update_rate_hz",
     "500",
     "it takes one MSP message each time: at 100 Hz commands and questions queue up",
     "100",
 )
 _OVERRIDE = (
-    Wanted("feature RX_MSP", "OFF", "the receiver stays as it is: MSP must not be the receiver", "OFF", absent=True),
-    Wanted("msp_override_channels_mask", "15", "MSP says roll, pitch, yaw and throttle, and nothing else", "0"),
-    Wanted(
+    Setting("feature RX_MSP", "OFF", "the receiver stays as it is: MSP must not be the receiver", "OFF", absent=True),
+    Setting("msp_override_channels_mask", "15", "MSP says roll, pitch, yaw and throttle, and nothing else", "0"),
+    Setting(
         "msp_override_failsafe", "OFF", "a receiver that is lost is a failsafe, whatever MSP says", "OFF", absent=True
     ),
 )
 _BY_PILOT = (
-    Wanted("ARM by a switch", "ON", "the pilot arms and disarms, by any switch of the receiver",
-           line=f"aux 0 {ARM} 0 1700 2100 0 0"),
-    Wanted("MSP OVERRIDE by another", "ON", "the pilot hands over and takes back; ANGLE must be off meanwhile",
-           line=f"aux 1 {MSP_OVERRIDE} 1 1700 2100 0 0"),
+    Setting("ARM by a switch", "ON", "the pilot arms and disarms, by any switch of the receiver",
+            line=f"aux 0 {ARM} 0 1700 2100 0 0"),
+    Setting("MSP OVERRIDE by another", "ON", "the pilot hands over and takes back; ANGLE must be off meanwhile",
+            line=f"aux 1 {MSP_OVERRIDE} 1 1700 2100 0 0"),
 )  # fmt: skip
 _BY_LINK = (
-    Wanted("ARM", "AUX1 1700-2100", "the switch that arms is AUX1, at 2000 us; nothing else may arm",
-           line=f"aux 0 {ARM} 0 1700 2100 0 0"),
-    Wanted("levelling", "OFF", "by hand, in the Modes tab: sticks mean rates with AUX1 at 2000 us, the others at 1000",
-           line="# ANGLE and HORIZON off"),
+    Setting("ARM", "AUX1 1700-2100", "the switch that arms is AUX1, at 2000 us; nothing else may arm",
+            line=f"aux 0 {ARM} 0 1700 2100 0 0"),
+    Setting("levelling", "OFF", "by hand, in the Modes tab: sticks mean rates with AUX1 at 2000 us, the others at 1000",
+            line="# ANGLE and HORIZON off"),
 )  # fmt: skip
 _MASTER = (
-    Wanted("map", "AETR1234", "roll, pitch, throttle, yaw: the order in which the link sends", "AETR1234",
+    Setting("map", "AETR1234", "roll, pitch, throttle, yaw: the order in which the link sends", "AETR1234",
            line="map AETR1234"),
-    Wanted("mid_rc", "1500", "the sticks' centre", "1500"),
-    Wanted("deadband", "0", "small rates count", "0"),
-    Wanted("yaw_deadband", "0", "small rates count", "0"),
-    Wanted("yaw_control_reversed", "OFF", "yaw has the sign that the link gives it", "OFF"),
-    Wanted("min_check", f"{ThrustMap.min_check:.0f}", "where the throttle begins, as in the link's ThrustMap", "1050"),
-    Wanted("motor_idle", f"{1e4 * ThrustMap.idle:.0f}", f"{ThrustMap.idle:.1%}, as in the link's ThrustMap", "550",
-           former="dshot_idle_value"),
-    Wanted("feature AIRMODE", "ON", "rates are followed at least throttle too", "ON"),
-    Wanted("failsafe_delay", "5", "motors stop 0.5 s after the last message: the last line of defence", "15"),
-    Wanted("failsafe_procedure", "DROP", "a drone in a room falls rather than flies on", "DROP"),
+    Setting("mid_rc", "1500", "the sticks' centre", "1500"),
+    Setting("deadband", "0", "small rates count", "0"),
+    Setting("yaw_deadband", "0", "small rates count", "0"),
+    Setting("yaw_control_reversed", "OFF", "yaw has the sign that the link gives it", "OFF"),
+    Setting("min_check", f"{ThrustMap.min_check:.0f}", "where the throttle begins, as in the link's ThrustMap", "1050"),
+    Setting("motor_idle", f"{1e4 * ThrustMap.idle:.0f}", f"{ThrustMap.idle:.1%}, as in the link's ThrustMap", "550",
+            former="dshot_idle_value"),
+    Setting("feature AIRMODE", "ON", "rates are followed at least throttle too", "ON"),
+    Setting("failsafe_delay", "5", "motors stop 0.5 s after the last message: the last line of defence", "15"),
+    Setting("failsafe_procedure", "DROP", "a drone in a room falls rather than flies on", "DROP"),
     *(
-        Wanted(f"rxfail {channel}", "a", f"{stick} when the radio falls silent: sticks centred, throttle low", "a",
-               line=f"rxfail {channel} a")
+        Setting(f"rxfail {channel}", "a", f"{stick} when the radio falls silent: sticks centred, throttle low", "a",
+                line=f"rxfail {channel} a")
         for channel, stick in enumerate(("roll", "pitch", "yaw", "throttle"))
     ),
-    Wanted("rc_smoothing", "OFF", "a rate counts at once; this filter is the slower, the rarer commands are", "ON"),
-    Wanted("yaw_spin_recovery", "OFF", "the firmware must not take over in flight: the loop cuts what tumbles", "AUTO"),
+    Setting("rc_smoothing", "OFF", "a rate counts at once; this filter is the slower, the rarer commands are", "ON"),
+    Setting("yaw_spin_recovery", "OFF", "the firmware must not take over in flight: the loop cuts what tumbles",
+            "AUTO"),
 )  # fmt: skip
 _SIMULATED = tuple(
-    Wanted(name, value, "the plant's rotors have no torque of speeding up: its own would swing", default, "profile")
+    Setting(name, value, "the plant's rotors have no torque of speeding up: its own would swing", default, "profile")
     for name, value, default in (("p_yaw", "30", "45"), ("i_yaw", "5", "80"))
 )
 _PROFILE = (
     *(
-        Wanted(
+        Setting(
             f"f_{axis}",
             "0",
             "no feedforward: each command is a step, and would kick",
@@ -350,9 +351,9 @@ _PROFILE = (
         )
         for axis, default in (("roll", "120"), ("pitch", "125"), ("yaw", "120"))
     ),
-    Wanted("dyn_idle_min_rpm", "0", "idle is a share of the command, not a speed", "0", "profile", absent=True),
-    Wanted("thrust_linear", "0", "the link's ThrustMap does this", "0", "profile"),
-    Wanted("throttle_boost", "0", "throttle means thrust, however fast it moves", "5", "profile"),
-    Wanted("vbat_sag_compensation", "0", "the link's ThrustMap counts the battery's voltage itself", "0", "profile"),
-    Wanted("motor_output_limit", "100", "full throttle must be full thrust", "100", "profile"),
+    Setting("dyn_idle_min_rpm", "0", "idle is a share of the command, not a speed", "0", "profile", absent=True),
+    Setting("thrust_linear", "0", "the link's ThrustMap does this", "0", "profile"),
+    Setting("throttle_boost", "0", "throttle means thrust, however fast it moves", "5", "profile"),
+    Setting("vbat_sag_compensation", "0", "the link's ThrustMap counts the battery's voltage itself", "0", "profile"),
+    Setting("motor_output_limit", "100", "full throttle must be full thrust", "100", "profile"),
 )

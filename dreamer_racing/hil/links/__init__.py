@@ -98,10 +98,10 @@ def make_link(config: LinkConfig) -> TransportLink:
             f"device={config.device} is for {', '.join(PROTOCOLS)}, and link={config.name} goes over UDP: choose one "
             "of those, or leave device= out."
         )
-    if config.imu and config.name not in FEELING:
+    if config.imu and config.name not in IMU_LINKS:
         raise ValueError(
             f"link={config.name} does not bring back what the IMU tells, and the actor flies by it: the links that do "
-            f"are {', '.join(FEELING)}."
+            f"are {', '.join(IMU_LINKS)}."
         )
     link = LINKS[config.name](config)
     try:
@@ -178,10 +178,10 @@ LINKS: dict[str, Callable[[LinkConfig], TransportLink]] = {
 }
 """Factory of each link, by name."""
 
-HEARING = ("crsf", "msp", "msp_override", "mavlink")
+BATTERY_LINKS = ("crsf", "msp", "msp_override", "mavlink")
 """Links that receive the battery's voltage."""
 
-FEELING = ("udp", "simulated", "betaflight_sitl", "msp", "msp_override", "mavlink")
+IMU_LINKS = ("udp", "simulated", "betaflight_sitl", "msp", "msp_override", "mavlink")
 """Links that can receive IMU samples."""
 
 

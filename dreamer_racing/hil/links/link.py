@@ -70,7 +70,7 @@ class TransportLink(ABC):
         self.thrust = thrust
         self._transport, self._telemetry = transport, telemetry
         self._armed = False  # whether the last command was armed
-        self._felt: list[ImuReading] = []
+        self._imu_samples: list[ImuReading] = []
 
     @property
     def rejected(self) -> int:
@@ -93,16 +93,16 @@ class TransportLink(ABC):
         readings = []
         for time, data in self._transport.read():
             readings += [Reading(time, voltage) for voltage in self._telemetry.read(data)]
-            self._felt += [ImuReading(time, sample) for sample in self._telemetry.felt]
-            self._telemetry.felt.clear()
+            self._imu_samples += [ImuReading(time, sample) for sample in self._telemetry.imu_samples]
+            self._telemetry.imu_samples.clear()
         return readings
 
-    def feel(self) -> list[ImuReading]:
+    def read_imu(self) -> list[ImuReading]:
         """Return the IMU samples received up to the last `listen`, oldest first."""
-        felt, self._felt = self._felt, []
-        return felt
+        samples, self._imu_samples = self._imu_samples, []
+        return samples
 
-    def reckon_with(self, voltage: float) -> None:
+    def set_voltage(self, voltage: float) -> None:
         """Set the thrust map's voltage, V, or the nearest that it can have (`ThrustMap.at`).
 
         A reading in flight never raises: one beyond what `ThrustMap.check` allows is clipped, one that is not finite is

@@ -131,7 +131,7 @@ class MavlinkTelemetry(Telemetry):
             if kind in SAMPLES and message.get_srcSystem() == self._system:
                 sample = SAMPLES[kind](message)
                 self.rejected += sample is None
-                self.felt += [] if sample is None else [sample]
+                self.imu_samples += [] if sample is None else [sample]
             if kind == "BAD_DATA":
                 self.rejected += 1
             elif message.get_srcSystem() == self._system and kind in VOLTAGES and not _is_another(message):

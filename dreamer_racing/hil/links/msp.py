@@ -118,7 +118,7 @@ class MspTelemetry(Telemetry):
                 self.rejected += voltage is None
             elif kind == RAW_IMU:
                 sample = self._sample(payload) if answered else None
-                self.felt += [] if sample is None else [sample]
+                self.imu_samples += [] if sample is None else [sample]
                 self.rejected += sample is None
             elif kind == STATUS and answered:
                 self.status = read_status(payload) or self.status

@@ -12,13 +12,13 @@ class Telemetry(ABC):
     """Extracts battery voltages and IMU samples from bytes that arrive in chunks. Other frames are ignored.
 
     Attributes:
-        felt: IMU samples (6,) found so far, oldest first, see `hil.imu`; whoever reads them clears the list.
+        imu_samples: IMU samples (6,) found so far, oldest first, see `hil.imu`; whoever reads them clears the list.
         rejected: Number of frames that were damaged or without a usable value, and of byte runs that were no frame.
     """
 
     def __init__(self) -> None:
         self.rejected = 0
-        self.felt: list[np.ndarray] = []
+        self.imu_samples: list[np.ndarray] = []
 
     @abstractmethod
     def read(self, data: bytes) -> list[float]:

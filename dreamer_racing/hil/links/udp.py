@@ -142,7 +142,7 @@ class PacketTelemetry(Telemetry):
         """Parse a datagram, which has no voltages."""
         sample = decode_imu(data)
         self.rejected += sample is None
-        self.felt += [] if sample is None else [sample]
+        self.imu_samples += [] if sample is None else [sample]
         return []
 
 

@@ -19,7 +19,7 @@ from dreamer_racing.envs.drone.parameters import (
     save_drone,
 )
 from dreamer_racing.envs.drone.quadrotor import Quadrotor
-from dreamer_racing.envs.drone.rate_loop import Own, RateLoop, Row
+from dreamer_racing.envs.drone.rate_loop import DroneParameter, RateLoop, Row
 from tests.running_recipes import module_of
 
 DRONE = replace(PRESETS["betaflight"], randomisation=None)
@@ -119,7 +119,9 @@ def test_a_drone_draws_its_own_firmware_and_resets_alone() -> None:
     quadrotor.reset(torch.ones(64, dtype=torch.bool))
     loop, widths = quadrotor.rate_loop, PRESETS["betaflight"].randomisation
     assert loop is not None and widths is not None
-    gains, filters, motors_own = loop.own[:, : Own.FILTERS], loop.own[:, Own.FILTERS, :2], loop.own[:, Own.MOTORS]
+    parameters = loop.drone_parameters
+    gains, filters = parameters[:, : DroneParameter.FILTERS], parameters[:, DroneParameter.FILTERS, :2]
+    motors_own = parameters[:, DroneParameter.MOTORS]
     for values, width in ((gains, widths.gains), (filters, widths.filters)):
         assert (values - 1.0).abs().max() <= width and values.std() > 0.4 * width
     lag = -0.001 / motors_own[:, 0].log()
@@ -127,10 +129,10 @@ def test_a_drone_draws_its_own_firmware_and_resets_alone() -> None:
     assert motors_own[:, 2].min() >= 0.0 and motors_own[:, 2].max() <= widths.sag_max
     delays = quadrotor.own_parameters()[-1]
     assert delays.min() >= 5 and delays.max() <= 35
-    before = loop.own.clone()
+    before = loop.drone_parameters.clone()
     mask = torch.arange(64) == 3
     quadrotor.reset(mask)
-    assert torch.equal(loop.own[~mask], before[~mask]) and not torch.equal(loop.own[mask], before[mask])
+    assert torch.equal(parameters[~mask], before[~mask]) and not torch.equal(parameters[mask], before[mask])
 
 
 def test_a_battery_that_sags_gives_less_thrust_the_more_is_asked() -> None:

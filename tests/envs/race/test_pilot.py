@@ -5,7 +5,7 @@ import torch
 
 from dreamer_racing.envs.drone.parameters import PRESETS
 from dreamer_racing.envs.race import racing_line
-from dreamer_racing.envs.race.flown_laps import fly_laps
+from dreamer_racing.envs.race.flown_laps import evaluate_pilot
 from dreamer_racing.envs.race.gates import CrashCause
 from dreamer_racing.envs.race.pilot import PilotPolicy, ScriptedPilot
 from dreamer_racing.envs.race.racing_line import (
@@ -34,7 +34,7 @@ def circle_line() -> RacingLine:
 @pytest.mark.parametrize("preset", ["easy", "faithful"])
 @pytest.mark.parametrize("track", PLAIN_TRACKS)
 def test_pilot_flies_three_clean_and_fast_laps(track: str, preset: str) -> None:
-    flight = fly_laps(track, preset, num_envs=1 if preset == "easy" else 4)
+    flight = evaluate_pilot(track, preset, num_envs=1 if preset == "easy" else 4)
     assert flight.crash.tolist() == [CrashCause.NONE] * len(flight.crash)
     assert flight.finished.all()
     assert (flight.gates == 3 * load_track(track).num_gates).all()
@@ -43,7 +43,7 @@ def test_pilot_flies_three_clean_and_fast_laps(track: str, preset: str) -> None:
 
 
 def test_pilot_flies_from_the_poses_in_which_training_starts() -> None:
-    flight = fly_laps("circle", "easy", num_envs=16, laps=1, random_starts=True, seed=3)
+    flight = evaluate_pilot("circle", "easy", num_envs=16, laps=1, random_starts=True, seed=3)
     assert flight.finished.all()
 
 

@@ -269,7 +269,7 @@ def test_every_kernel_compiles_for_cuda(tmp_path: Path, monkeypatch: pytest.Monk
         simulator.step(torch.zeros(2, 4))
         simulator.render()
     ran = {name: module for name, module in warp._src.context.user_modules.items() if module.execs}
-    for wanted in ("push", "settle", "_render_megakernel", "forward", "smooth"):
+    for wanted in ("apply_controls", "correct_step", "_render_megakernel", "forward", "smooth"):
         assert any(wanted in name for name in ran), f"{wanted} was not launched, so the test would not see it"
     monkeypatch.setattr(warp.config, "optimization_level", 0)  # whether it compiles is known before any of it
     for name, module in ran.items():

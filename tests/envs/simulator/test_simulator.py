@@ -332,7 +332,7 @@ def without(*libraries: str):
 
 def test_auto_falls_back_and_says_why(monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture) -> None:
     monkeypatch.setattr(opengl.ctypes, "CDLL", without("libEGL", "libOSMesa"))
-    rendering.say_once.cache_clear()
+    rendering.log_once.cache_clear()
     with caplog.at_level(logging.INFO, logger=rendering.__name__):
         made = simulator(2, "auto")
     assert made.renderer is not None
@@ -345,7 +345,7 @@ def test_auto_falls_back_and_says_why(monkeypatch: pytest.MonkeyPatch, caplog: p
 
 
 def test_a_renderer_that_was_asked_for_is_no_warning_and_said_once(caplog: pytest.LogCaptureFixture) -> None:
-    rendering.say_once.cache_clear()
+    rendering.log_once.cache_clear()
     with caplog.at_level(logging.INFO, logger=rendering.__name__):
         simulator(2, "warp").close()
         simulator(2, "warp").close()  # of evaluations, say
@@ -369,7 +369,7 @@ def test_opengl_that_does_not_start_is_a_reason_too(monkeypatch: pytest.MonkeyPa
 
 
 def test_unknown_renderer_is_refused() -> None:
-    known = ", ".join(("auto", *rendering.RENDERERS, rendering.HYBRID))
+    known = ", ".join(("auto", *rendering.RENDERERS, rendering.WARP_CUDA))
     with pytest.raises(ValueError, match=f"Unknown renderer 'vulkan': use {known}, or None"):
         simulator(1, "vulkan")
 
@@ -380,7 +380,7 @@ def test_a_renderer_without_a_worker_is_no_other_one(monkeypatch: pytest.MonkeyP
         simulator(1, "vulkan")
 
 
-@pytest.mark.parametrize("name", [*rendering.RENDERERS, rendering.HYBRID])
+@pytest.mark.parametrize("name", [*rendering.RENDERERS, rendering.WARP_CUDA])
 def test_every_renderer_is_in_the_table_and_has_a_worker(name: str) -> None:
     assert f"`{name}`" in (rendering.__doc__ or "")
     renderer_or_skip(name)

@@ -12,8 +12,8 @@ import numpy as np
 import pytest
 
 from dreamer_racing.envs.drone.parameters import GRAVITY
-from dreamer_racing.hil.imu import PACKET_SIZE, decode_imu, encode_imu, unlike_rest
-from dreamer_racing.hil.links import HEARING, LINKS, LinkConfig, make_link
+from dreamer_racing.hil.imu import PACKET_SIZE, check_at_rest, decode_imu, encode_imu
+from dreamer_racing.hil.links import BATTERY_LINKS, LINKS, LinkConfig, make_link
 from dreamer_racing.hil.links.crsf import CrsfTelemetry, crc8, encode_crsf
 from dreamer_racing.hil.links.link import ASK_EVERY, ChannelLink
 from dreamer_racing.hil.links.mavlink import MavlinkTelemetry
@@ -225,7 +225,7 @@ def test_nobody_there_is_still_counted_when_it_was_reading_that_found_out():
 
 
 def test_which_links_hear():
-    assert set(HEARING) < set(LINKS)
+    assert set(BATTERY_LINKS) < set(LINKS)
 
 
 # What flight controllers tell of their IMU: vectors by hand, one of the firmware itself, and what is none.
@@ -248,7 +248,7 @@ def test_msp_tells_what_the_imu_tells(counts: float) -> None:
     telemetry = MspTelemetry(counts)
     data = b"noise" + raw_imu(counts)
     assert [telemetry.read(data[index : index + 1]) for index in range(len(data))] == [[]] * len(data)
-    (sample,) = telemetry.felt
+    (sample,) = telemetry.imu_samples
     assert np.allclose(sample[:3], TURNING, atol=0.002)
     assert np.allclose(sample[3:], FORCE, atol=0.02)
 
@@ -259,14 +259,14 @@ def test_an_answer_of_the_firmware_itself() -> None:
     frame = b"$M>" + bytes([18, 102]) + struct.pack("<9h", *counts)
     telemetry = MspTelemetry(256.0)
     telemetry.read(frame + bytes([reduce(xor, frame[3:])]))
-    assert np.allclose(telemetry.felt[0], (1.0, 2.0, 3.0, -1.0, -2.0, GRAVITY), atol=0.01)
+    assert np.allclose(telemetry.imu_samples[0], (1.0, 2.0, 3.0, -1.0, -2.0, GRAVITY), atol=0.01)
 
 
 @pytest.mark.parametrize("frame", [b"$M!\x00ff", b"$M>\x04f" + bytes(4) + b"b"], ids=["refused", "short"])
 def test_msp_without_an_imu_is_rejected(frame: bytes) -> None:
     telemetry = MspTelemetry()
     assert telemetry.read(frame) == []
-    assert (telemetry.felt, telemetry.rejected) == ([], 1)
+    assert (telemetry.imu_samples, telemetry.rejected) == ([], 1)
 
 
 def test_mavlink_tells_what_the_imu_tells() -> None:
@@ -279,10 +279,10 @@ def test_mavlink_tells_what_the_imu_tells() -> None:
     telemetry = MavlinkTelemetry()
     for message in (highres, common.MAVLink_scaled_imu_message(0, *scaled, 0, 0, 0)):
         assert telemetry.read(bytes(message.pack(sender))) == []
-    assert np.allclose(telemetry.felt, [(*TURNING, *FORCE)] * 2, atol=0.01)
-    telemetry.felt.clear()
+    assert np.allclose(telemetry.imu_samples, [(*TURNING, *FORCE)] * 2, atol=0.01)
+    telemetry.imu_samples.clear()
     telemetry.read(bytes(highres.pack(common.MAVLink(None, 7, 1))))
-    assert telemetry.felt == []
+    assert telemetry.imu_samples == []
 
 
 def test_a_packet_of_the_plant_and_what_is_none() -> None:
@@ -299,7 +299,7 @@ def test_a_packet_of_the_plant_and_what_is_none() -> None:
         assert decode_imu(broken) is None
     telemetry = PacketTelemetry()
     assert telemetry.read(packet) == telemetry.read(b"") == []
-    assert (len(telemetry.felt), telemetry.rejected) == (1, 1)
+    assert (len(telemetry.imu_samples), telemetry.rejected) == (1, 1)
 
 
 def test_a_link_gives_samples_once_with_their_time_of_arrival() -> None:
@@ -312,12 +312,12 @@ def test_a_link_gives_samples_once_with_their_time_of_arrival() -> None:
     sample = np.array((*TURNING, *FORCE))
     for _ in range(2):
         vehicle.sendto(encode_imu(0, 0.0, sample), address)
-    assert link.feel() == [], "before it has listened"
+    assert link.read_imu() == [], "before it has listened"
     assert link.listen() == []
-    felt = link.feel()
-    assert [reading.sample.tolist() for reading in felt] == [sample.tolist()] * 2
-    assert felt[0].time <= felt[1].time
-    assert link.feel() == []
+    samples = link.read_imu()
+    assert [reading.sample.tolist() for reading in samples] == [sample.tolist()] * 2
+    assert samples[0].time <= samples[1].time
+    assert link.read_imu() == []
     link.close()
     vehicle.close()
 
@@ -331,6 +331,6 @@ def test_links_that_hear_none_are_refused(name: str) -> None:
 
 
 def test_what_stands_still_weighs_its_weight() -> None:
-    assert unlike_rest(np.array((0.0, 0.0, 0.0, 0.5, -0.5, 9.6))) is None
-    words = unlike_rest(np.array((0.0, 0.0, 0.0, 0.0, 0.0, 4.9)))
+    assert check_at_rest(np.array((0.0, 0.0, 0.0, 0.5, -0.5, 9.6))) is None
+    words = check_at_rest(np.array((0.0, 0.0, 0.0, 0.0, 0.0, 4.9)))
     assert words is not None and "shows 4.9 m/s² where it stands" in words
