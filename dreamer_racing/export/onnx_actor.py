@@ -114,7 +114,7 @@ class RecurrentActor:
             observation: uint8 RGB image (height, width, 3), top row first, or float32 vector (V,), as the contract's
                 first input specifies.
             noise: Only for ``latent=sample``: uniform numbers in [0, 1), float32 (L, K); drawn here if None.
-            imu: Only if the actor has one (`needs_imu`): body rates, rad/s, and specific force, m/s², FLU, float32 (6,).
+            imu: Only if the actor has one (`needs_imu`): rates, rad/s, and specific force, m/s², in FLU, float32 (6,).
 
         Returns:
             Action, float32 (A,) in [−1, 1]; `setpoint` converts it to units.
