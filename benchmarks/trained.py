@@ -23,15 +23,8 @@ from dreamer_racing.training.checkpoint import load_components
 from dreamer_racing.training.directory import RunDirectory, latest_checkpoint
 
 __all__ = [
-    "Trained",
-    "WorldModelRunConfig",
-    "fly",
-    "make_env",
-    "restore",
-    "restore_replay",
-    "shared_env_arguments",
-    "size_of",
-]
+    "Trained", "WorldModelRunConfig", "fly", "make_env", "restore", "restore_replay", "shared_env_arguments", "size_of",
+]  # fmt: skip
 
 
 class Trained(NamedTuple):
