@@ -14,7 +14,7 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from dreamer_racing.hil.aside import BackgroundWorker
+from dreamer_racing.hil.background_worker import BackgroundWorker
 from dreamer_racing.hil.battery import Reading
 from dreamer_racing.hil.chain import FlightChain, Inputs, Outputs, describe_inputs, describe_outputs
 from dreamer_racing.hil.operator import Operator, OperatorSource

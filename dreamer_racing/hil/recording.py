@@ -20,7 +20,7 @@ import numpy as np
 
 from dreamer_racing.commands import install_extra
 from dreamer_racing.envs.tracks import Track, load_track, read_track
-from dreamer_racing.hil.aside import BackgroundWorker
+from dreamer_racing.hil.background_worker import BackgroundWorker
 
 FLIGHT, TICK = "/flight", "/tick"
 FILE = "flight.mcap"
