@@ -13,8 +13,8 @@ A folder of results is described by its `provenance.json`, an entry or a list of
 `title` and `files`, relative to the folder, are required. What is null or missing is read from the records of its JSON
 files where they have it (`machine`, `commit`), and otherwise the page says that it was not recorded. `command` is what
 was run at `commit`, which the page links; `today` starts the same now, and is printed. Rows of `headline` make the
-second table. `fills` names cells of results/planned.json, the table of what is to be run, and may say what a cell
-shows instead of the title; a cell that nothing fills says so. With `"brief": true` an entry is a row of the last table,
+second table. `fills` names cells of results/planned.json, the table of what is to be run (with a `picture` below it), and
+may say what a cell shows instead of the title; a cell that nothing fills says so. With `"brief": true` an entry is a row of the last table,
 which shows its `result`, with no commands and no pictures; without a `result` another page shows it.
 """
 
@@ -203,6 +203,8 @@ def table_text(table: dict[str, Any], entries: list[Entry]) -> str:
         links = ([f"[{e.fills[name]}](#{e.anchor})" for e in entries if name in e.fills] for name in names)
         cells = ["<br>".join(found) or NOT_RUN for found in links]
         lines.append(f"| {title} | {' | '.join(cells)} |")
+    if picture := table.get("picture"):
+        lines.append(f"\n![{picture['caption']}](../{picture['file']})")
     return "\n".join([*lines, ""])
 
 
@@ -215,7 +217,7 @@ def headline_text(entries: list[Entry]) -> list[str]:
         for entry in entries
         for row in entry.headline
     ]
-    head = "## At a glance\n\nPut `OMP_NUM_THREADS=1 ./dev python recipes/` before a command of the last column.\n"
+    head = "## Other trainings\n\nPut `OMP_NUM_THREADS=1 ./dev python recipes/` before a command of the last column.\n"
     table = "| result | success, or as said | seeds | minutes | command |\n|---|---|---|---|---|"
     return [head, table, *rows, ""] if rows else []
 

@@ -85,6 +85,13 @@ def test_cells_may_say_what_they_show(results, folder):
     assert "| PPO | not run | [99 %](#one-a-result) |" in results.make_page(folder)
 
 
+def test_a_planned_table_may_have_a_picture_below_it(results, folder):
+    (table,) = json.loads((folder / "planned.json").read_text())
+    table["picture"] = {"file": "docs/media/curves.png", "caption": "All curves."}
+    (folder / "planned.json").write_text(json.dumps([table]))
+    assert "[One: a result](#one-a-result) |\n\n![All curves.](../docs/media/curves.png)" in results.make_page(folder)
+
+
 def test_brief_entries_are_rows_of_the_last_table(results, folder):
     change(folder, brief=True, result="a figure", command="python x.py")
     page = results.make_page(folder)
@@ -100,12 +107,12 @@ def test_the_page_prints_what_starts_it_today_and_links_what_was_run(results, fo
 
 
 def test_headlines_are_the_second_table_and_link_to_their_sections(results, folder):
-    assert "## At a glance" not in results.make_page(folder)
+    assert "## Other trainings" not in results.make_page(folder)
     row = {"result": "PPO", "value": "99 %", "seeds": "2", "minutes": "3", "command": "`ppo.py`"}
     change(folder, headline=[row])
     page = results.make_page(folder)
     assert "| [PPO](#one-a-result) | 99 % | 2 | 3 | `ppo.py` |" in page
-    assert page.index("## Planned") < page.index("## At a glance")
+    assert page.index("## Planned") < page.index("## Other trainings")
 
 
 def test_many_files_are_linked_by_their_folder(results, folder):
