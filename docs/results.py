@@ -64,16 +64,18 @@ lap time           best 3.96 s, mean 4.06 s (297 laps)
 
 | word | meaning on this page |
 |---|---|
-| success | share of flights that finish three laps, each from another randomised start, by the deterministic policy |
+| success | share of flights that finish three laps, each from another randomised start, by the deterministic policy. Of 100 flights, 97 % means 92 to 99 % (95 % interval), 55 % means 45 to 64 % |
 | sampled | success of the stochastic policy, whose actions are samples from its distribution |
-| minutes | of one core, for the whole training. Rows are of different CPUs (factor two): compare env_steps |
+| last weights | the averaged ones (`model.average_rate`), as in flight |
+| lap | mean over all complete laps, the first from rest, also of flights that crash later |
+| minutes | of one core, for the whole training; on CPUs whose speeds differ by two. For comparisons take env_steps |
 | state decoded | in training the world model learns the true state; in flight the agent sees only images |
 | `schedule.NAME` | moves setting NAME as more gates are passed ([clock `known`](recipes.md#options)) |
 """
 FOOT = """## Where the numbers come from
 
-The commands on this page use today's defaults; the original ones are behind *Commands, commits, machine*. There
-`recipes/latent_ppo.py` is still called `recipes/dreamer_v3.py` (before commit 2c16a57). `./dev python docs/results.py`
+The commands on this page use today's defaults; the original ones are behind *Commands, commits, machine*. Before commit
+2c16a57 latent PPO was called `recipes/dreamer_v3.py`, so a `dreamer_v3.py` of those commits is latent PPO. `./dev python docs/results.py`
 writes this page from the `provenance.json` files in [results/](../results): change those."""
 
 

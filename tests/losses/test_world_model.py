@@ -267,7 +267,7 @@ def test_the_target_is_what_its_text_says(my_losses):
 
 def test_an_objective_of_the_default_algorithm_is_what_moves_the_actor(my_losses):
     gradients = []
-    for actor in ("reinforce", "my_losses:smooth_reinforce"):
+    for actor in ("dynamics", "my_losses:smooth_dynamics"):
         learner = learner_of(seed=0, actor=actor, **CONFIG)
         torch.nn.init.normal_(learner.agent.actor.mlp.output.weight, generator=torch.Generator().manual_seed(0))
         torch.manual_seed(1)

@@ -31,7 +31,7 @@ LARGER = (ROOT / "examples" / "losses" / "overshooting.py").read_text(encoding="
 LOSSES, REWARDS = "\n\n".join([*written("losses.md"), LARGER]), "\n\n".join(written("own_rewards.md")[:-1])
 OVERRIDES = [
     "loss.world_model=reconstruction+my_losses:Overshooting",
-    "loss.actor=my_losses:smooth_reinforce",
+    "loss.actor=my_losses:smooth_dynamics",
     "env.reward=my_rewards:smooth",
 ]
 
