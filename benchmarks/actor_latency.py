@@ -38,13 +38,13 @@ COLUMNS = (
 def main() -> None:
     """Measure every requested actor, one after another."""
     parser = make_parser(__doc__)
-    parser.add_argument("--actors", nargs="*", default=[], help="agents that ship by their names, or .onnx files")
+    parser.add_argument("--actors", nargs="*", default=[], help="names of included agents, or .onnx files")
     parser.add_argument("--sizes", nargs="*", default=[], choices=SIZES, metavar="SIZE", help=f"of {', '.join(SIZES)}")
-    parser.add_argument("--track", default="circle", help="that contracts of sizes name")
-    parser.add_argument("--rate", type=float, default=50.0, help="Hz, that contracts of sizes name")
-    parser.add_argument("--steps", type=int, default=2000, help="timed")
+    parser.add_argument("--track", default="circle", help="track in the contracts of sizes")
+    parser.add_argument("--rate", type=float, default=50.0, help="control rate in the contracts of sizes, Hz")
+    parser.add_argument("--steps", type=int, default=2000, help="number of timed steps")
     parser.add_argument("--threads", type=int, default=1)
-    parser.add_argument("--keep", help="folder in which exports of sizes stay")
+    parser.add_argument("--keep", help="folder in which to keep the exports of sizes")
     arguments = parser.parse_args()
     if not arguments.actors and not arguments.sizes:
         parser.error("nothing to measure: give --actors or --sizes")

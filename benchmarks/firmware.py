@@ -41,7 +41,7 @@ def main() -> None:
     """Fly every requested flyer."""
     parser = make_parser(__doc__)
     flyers = ["circle_betaflight", "kidney_betaflight", "figure8_betaflight", "pilot"]
-    parser.add_argument("--flyers", nargs="+", default=flyers, help="agents of agents/, or pilot")
+    parser.add_argument("--flyers", nargs="+", default=flyers, help="agents in agents/, or pilot")
     parser.add_argument("--flights", type=int, default=10)
     arguments = parser.parse_args()
     contract = read_contract(AGENTS / "circle" / "contract.json")  # the firmware settings are the same for all flyers

@@ -34,10 +34,10 @@ LONGEST = 120  # s, timeout of a flight, including the start of both programs
 def main() -> None:
     """Fly every actor the given number of times, one flight after another."""
     parser = make_parser(__doc__)
-    parser.add_argument("--actors", nargs="+", required=True, help="agents that ship, paths of exports, or pilot")
-    parser.add_argument("--flights", type=int, default=1, help="of each, with seeds from 1 on")
+    parser.add_argument("--actors", nargs="+", required=True, help="included agents, paths of exports, or pilot")
+    parser.add_argument("--flights", type=int, default=1, help="flights of each actor, with seeds from 1 on")
     parser.add_argument("--laps", type=int, default=3)
-    parser.add_argument("--disarmed", type=float, metavar="SECONDS", help="never arm, and end after so long")
+    parser.add_argument("--disarmed", type=float, metavar="SECONDS", help="never arm, and end after this time")
     parser.add_argument("--plant", nargs="*", default=PLANT, help="options of recipes/plant.py")
     parser.add_argument("--hil", nargs="*", default=[], help="further options of recipes/hil.py")
     arguments = parser.parse_args()

@@ -77,10 +77,10 @@ def main() -> None:
     """Run the requested jobs, run one measurement of a job, or write the page."""
     parser = make_parser(__doc__)
     parser.add_argument("--stages", nargs="*", default=list(STAGES), choices=STAGES)
-    parser.add_argument("--jobs", nargs="*", help="names of jobs, if not all of a stage")
-    parser.add_argument("--budget", type=float, default=1800.0, help="s for all of it")
+    parser.add_argument("--jobs", nargs="*", help="names of the jobs to run; default: all jobs of the stages")
+    parser.add_argument("--budget", type=float, default=1800.0, help="total time, s")
     parser.add_argument("--device", default="cuda")
-    parser.add_argument("--tiny", action="store_true", help="the smallest of everything: measures nothing")
+    parser.add_argument("--tiny", action="store_true", help="smallest settings, to test the script: measures nothing")
     parser.add_argument("--caches", default=".gpu_caches", help="folder of compiled kernels, and of the training run")
     parser.add_argument("--page", metavar="JSONL", help="write the table of docs/benchmarks.md from these results")
     parser.add_argument("--measure", help=argparse.SUPPRESS)  # used by the jobs' processes
@@ -93,7 +93,7 @@ def main() -> None:
         write_page(Path(arguments.page), PAGE)
         return
     if not arguments.json:
-        parser.error("--json FILE: where the results go.")
+        parser.error("--json FILE is required: the results are written there.")
     run(arguments)
 
 
@@ -145,7 +145,7 @@ def attempt(job: Job, limit: float, caches: Path) -> dict[str, Any]:
         )
     except subprocess.TimeoutExpired as late:
         keep_output(caches, job, late.stdout, late.stderr)
-        why = f"more than {limit:.0f} s{'; it goes on the next time' if job.stage == 'train' else ''}"
+        why = f"more than {limit:.0f} s{'; the next start continues it' if job.stage == 'train' else ''}"
         return {"state": "too long", "why": why}
     lines = process.stdout.strip().splitlines()
     if process.returncode:
@@ -293,7 +293,7 @@ def measure_env(device: str, tiny: bool, number: str, preset: str, images: str) 
     stepped = [worlds.step(action).reward_base for _ in range(3)]
     difference = max(float((one - other).abs().max()) for one, other in zip(eager, stepped, strict=True))
     if difference > 1e-4:
-        raise RuntimeError(f"steps as a CUDA graph are not those of eager mode: rewards differ by {difference}.")
+        raise RuntimeError(f"steps in a CUDA graph differ from those in eager mode: rewards by {difference}.")
 
     steps = 3 if tiny else 1000
     generator = torch.Generator(device).manual_seed(0)
@@ -330,7 +330,7 @@ def measure_learner(device: str, tiny: bool, size: str) -> dict[str, Any]:
     course.close()
     first, last = (float(torch.stack(part).mean()) for part in (losses[:3], losses[-3:]))
     if not last < first:
-        raise RuntimeError(f"captured updates do not learn: an image's loss was {first} and is {last}.")
+        raise RuntimeError(f"captured updates do not learn: the image loss was {first} and is now {last}.")
     found = {"held_out_image_error": float(held_out["held_out/image_error"]), "flown_steps": flown.episode_length}
     return {"loss_before": first, "loss_after": last, **found}
 

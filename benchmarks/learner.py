@@ -60,22 +60,22 @@ NARROW: dict[str, Any] = {"belief": 32, "hidden": 16, "latents": 4, "classes": 4
 def main() -> None:
     """Measure every requested combination, each in a separate process."""
     parser = make_parser(__doc__)
-    parser.add_argument("--sizes", nargs="*", default=["cpu_small"], help=f"of {', '.join(SIZES)}")
+    parser.add_argument("--sizes", nargs="*", default=["cpu_small"], help=f"any of {', '.join(SIZES)}")
     parser.add_argument("--losses", nargs="*", default=["reconstruction"])
     parser.add_argument("--actor-losses", nargs="*", default=["reinforce"])
     parser.add_argument("--backends", nargs="*", default=["eager"], choices=BACKENDS)
     parser.add_argument("--batch", nargs=2, type=int, default=(8, 32), metavar=("B", "T"))
     parser.add_argument("--horizon", type=int, default=15)
-    parser.add_argument("--starts", type=int, help="latents of a batch that imagination begins from; default: all")
-    parser.add_argument("--image-size", type=int, default=64, help="pixels; peers keep to 64")
+    parser.add_argument("--starts", type=int, help="latents of a batch at which imagination starts; default: all")
+    parser.add_argument("--image-size", type=int, default=64, help="pixels; peers always use 64")
     parser.add_argument("--mixed-precision", action="store_true", help="bfloat16 autocast")
     parser.add_argument("--device", default="cuda" if torch.cuda.is_available() else "cpu")
     parser.add_argument("--threads", type=int, default=torch.get_num_threads())
-    parser.add_argument("--updates", type=int, default=20, help="timed, after those of warm-up")
-    parser.add_argument("--peers", nargs="*", default=[], choices=PEERS, help="timed as they are, and tuned")
-    parser.add_argument("--return-freed-memory", action="store_true", help="leave out keep_freed_memory()")
-    parser.add_argument("--few-kernels", action="store_true", help="as on a CUDA device by default")
-    parser.add_argument("--launches", action="store_true", help="count what a CUDA device would launch instead")
+    parser.add_argument("--updates", type=int, default=20, help="timed updates, after the warm-up")
+    parser.add_argument("--peers", nargs="*", default=[], choices=PEERS, help="each timed as it is, and tuned")
+    parser.add_argument("--return-freed-memory", action="store_true", help="do not call keep_freed_memory()")
+    parser.add_argument("--few-kernels", action="store_true", help="few kernels, the default on CUDA")
+    parser.add_argument("--launches", action="store_true", help="count kernel launches of a CUDA device, time nothing")
     parser.add_argument("--table", help="write the table of sizes to this Markdown file instead")
     arguments = parser.parse_args()
     if arguments.table:
@@ -118,7 +118,7 @@ def print_launches(parser: argparse.ArgumentParser, arguments: argparse.Namespac
     of_times = ("backends", "peers", "device", "updates", "threads")
     unused = (*of_times, "mixed_precision", "few_kernels", "image_size", "starts")
     if given := [name for name in unused if getattr(arguments, name) != parser.get_default(name)]:
-        parser.error(f"--launches counts kernels of both ways on a CPU: no --{given[0].replace('_', '-')} with it.")
+        parser.error(f"--launches counts kernels on a CPU: do not add --{given[0].replace('_', '-')}.")
     counted = [
         count_launches(size, loss, actor, arguments.batch, arguments.horizon, few)
         for size in arguments.sizes

@@ -53,7 +53,7 @@ def main() -> None:
     parser.add_argument("--only", nargs="+", choices=PARTS, default=PARTS)
     parser.add_argument("--num-envs", type=int, default=64, help="N")
     parser.add_argument("--steps", type=int, default=320, help="K")
-    parser.add_argument("--horizon", type=int, help="H; without: the learner's")
+    parser.add_argument("--horizon", type=int, help="H; default: the learner's")
     arguments = parser.parse_args()
     records = []
     for path in arguments.checkpoints:
@@ -75,7 +75,7 @@ def measure(trained: Trained, parts: tuple[str, ...], num_envs: int, steps: int)
         env = make_env(trained.config, num_envs)
         longest = cast(DroneRacingEnv, env).worlds.race.episode_steps - 1
         if steps > longest:
-            raise SystemExit(f"--steps {steps}: at most {longest}, so that no time runs out, which is no crash.")
+            raise SystemExit(f"--steps {steps}: must be at most {longest}, so that no episode reaches its time limit.")
         flight = fly(learner, env, steps)
         yield {"measured": "returns", "num_envs": num_envs, "steps": steps, **compare_returns(learner, flight)}
     if "gradient" in parts or "drift" in parts:

@@ -18,7 +18,7 @@ COMMIT = provenance()["commit"]
 def make_parser(description: str | None) -> argparse.ArgumentParser:
     """Make the argument parser of a benchmark, with the benchmark's docstring as help."""
     parser = argparse.ArgumentParser(description=description, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--json", help="file of the results")
+    parser.add_argument("--json", help="file for the results")
     return parser
 
 
@@ -60,7 +60,7 @@ def fill_page(page: Path, begin: str, end: str, lines: Iterable[str]) -> None:
     head, found, rest = page.read_text(encoding="utf-8").partition(begin)
     _, closed, tail = rest.partition(end)
     if not found or not closed:
-        raise SystemExit(f"{page} lacks the lines {begin} and {end}, between which the table goes.")
+        raise SystemExit(f"{page} lacks the lines {begin} and {end}, which must surround the table.")
     page.write_text("\n".join((head + begin, *lines, end + tail)), encoding="utf-8")
 
 

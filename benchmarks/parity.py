@@ -37,9 +37,9 @@ COLUMNS = ("track", "preset", "device", "mm_1s", "mm_2s", "image_difference", "i
 def main() -> None:
     """Compare the backends on every track."""
     parser = make_parser(__doc__)
-    parser.add_argument("--device", default="cpu", help="of mujoco_warp")
-    parser.add_argument("--renderer", default="warp", choices=RENDERERS, help="to compare with OpenGL too")
-    parser.add_argument("--images", help="PNG of image pairs: above OpenGL, below mujoco_warp")
+    parser.add_argument("--device", default="cpu", help="device of mujoco_warp")
+    parser.add_argument("--renderer", default="warp", choices=RENDERERS, help="renderer to compare with OpenGL, too")
+    parser.add_argument("--images", help="PNG of image pairs: OpenGL above, mujoco_warp below")
     arguments = parser.parse_args()
     records, pairs = [], []
     for preset in ("easy", "faithful"):

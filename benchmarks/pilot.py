@@ -32,7 +32,7 @@ def main() -> None:
     parser.add_argument("--presets", nargs="*", default=("easy", "faithful"))
     parser.add_argument("--speed", type=float, default=LineLimits().speed, help="fraction of the thrust limit")
     parser.add_argument("--num-envs", type=int, default=32, help="runs of a randomised preset")
-    parser.add_argument("--random-starts", action="store_true", help="start as training does")
+    parser.add_argument("--random-starts", action="store_true", help="start like training episodes")
     arguments = parser.parse_args()
     records = []
     for track in arguments.tracks:

@@ -68,13 +68,13 @@ def main() -> None:
     parser.add_argument("--track", default="kidney")
     parser.add_argument("--preset", default="easy")
     parser.add_argument(
-        "--images", nargs="*", help=f"of {' '.join(('none', *RENDERERS, WARP_CUDA, 'cuda'))}; default: the device's"
+        "--images", nargs="*", help=f"any of {' '.join(('none', *RENDERERS, WARP_CUDA, 'cuda'))}; default: the device's"
     )
     parser.add_argument("--looks", default="nominal", help="nominal | randomised")
     parser.add_argument("--image-size", type=int, default=64, help="pixels")
     parser.add_argument("--num-envs", nargs="*", type=int, help="N to try")
     parser.add_argument("--actor", help="size of the DreamerV3 policy; default: cpu_small, on cuda size12m")
-    parser.add_argument("--seconds", type=float, help="least time of a measurement; default: 1.5, on cuda 0.5")
+    parser.add_argument("--seconds", type=float, help="minimum time of a measurement; default: 1.5, on cuda 0.5")
     parser.add_argument(
         "--page", nargs="*", metavar="JSON", help="write the table of docs/benchmarks.md from these results"
     )
@@ -90,7 +90,7 @@ def main() -> None:
             try:
                 records.append(process.submit(job, *details).result())
             except (RendererUnavailableError, ImportError) as error:
-                print(f"{details[0]}: not here ({error})")
+                print(f"{details[0]}: not available ({error})")
     report(records, COLUMNS, arguments.json)
 
 

@@ -35,21 +35,21 @@ HEAD = """# Options
 Made by `python docs/options.py` from [recipes/composing/schema.py](../recipes/composing/schema.py) and the recipes:
 change those, not this page. `--help` of a recipe says the same. Options are [hydra](https://hydra.cc) overrides,
 `env.num_envs=64` or, for a whole group, `model=size12m`; the groups are the folders of
-[recipes/config](../recipes/config). What is "chosen" is settled by the recipe when it starts, by device, size or
-budget, and printed. A wrong name, type or value is refused with the field named.
+[recipes/config](../recipes/config). Where a default is "chosen", the recipe chooses it at its start, from device,
+size or budget, and prints it. A wrong name, type or value is an error that names the field.
 """
 
 
 def main() -> None:
     """Write both files, or compare them."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--check", action="store_true", help="only compare")
+    parser.add_argument("--check", action="store_true", help="only check that both files are up to date")
     arguments = parser.parse_args()
     for path, text in make_files().items():
         if not arguments.check:
             path.write_text(text, encoding="utf-8")
         elif path.read_text(encoding="utf-8") != text:
-            parser.error(f"{path.name} is not what the dataclasses make: run python docs/options.py.")
+            parser.error(f"{path.name} is not up to date: run python docs/options.py.")
 
 
 def make_files() -> dict[Path, str]:

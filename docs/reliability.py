@@ -105,7 +105,7 @@ CALLS = re.compile(r"(?:call|after opening) \d+ of (\d+)")
 def main() -> None:
     """Write the page, or compare it."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--check", action="store_true", help="only compare")
+    parser.add_argument("--check", action="store_true", help="only check that the page is up to date")
     there = PAGE.read_text(encoding="utf-8")
     page = fill(there, read_results(ROOT / "results"))
     if parser.parse_args().check:

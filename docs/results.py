@@ -13,9 +13,9 @@ A folder of results is described by its `provenance.json`, an entry or a list of
 `title` and `files`, relative to the folder, are required. What is null or missing is read from the records of its JSON
 files where they have it (`machine`, `commit`), and otherwise the page says that it was not recorded. `command` is what
 was run at `commit`, which the page links; `today` starts the same now, and is printed. Rows of `headline` make the
-second table. `fills` names cells of results/planned.json, the table of what is to be run (with a `picture` below it), and
-may say what a cell shows instead of the title; a cell that nothing fills says so. With `"brief": true` an entry is a row of the last table,
-which shows its `result`, with no commands and no pictures; without a `result` another page shows it.
+second table. `fills` names cells of results/planned.json, the table of planned runs (with a `picture` below it), and
+may say what a cell shows instead of the title; a cell that nothing fills says so. With `"brief": true` an entry is a
+row of the last table: its `result`, no commands, no pictures; without a `result` another page shows it.
 """
 
 import argparse
@@ -108,7 +108,7 @@ class Entry:
 def main() -> None:
     """Write the page, or compare it."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--check", action="store_true", help="only compare")
+    parser.add_argument("--check", action="store_true", help="only check that the page is up to date")
     arguments = parser.parse_args()
     try:
         text = make_page(ROOT / "results")
@@ -117,7 +117,7 @@ def main() -> None:
     if not arguments.check:
         PAGE.write_text(text, encoding="utf-8")
     elif PAGE.read_text(encoding="utf-8") != text:
-        parser.error(f"{PAGE.relative_to(ROOT)} is not what results/ makes: run python docs/results.py.")
+        parser.error(f"{PAGE.relative_to(ROOT)} is not up to date: run python docs/results.py.")
 
 
 def make_page(results: Path) -> str:
@@ -151,11 +151,11 @@ def read_entries(path: Path) -> Iterator[Entry]:
     for raw in content if isinstance(content, list) else [content]:
         for name in ("title", "files"):
             if not isinstance(raw, dict) or not raw.get(name):
-                raise ValueError(f"{path}: an entry has no {name}. What one looks like: the head of docs/results.py.")
+                raise ValueError(f"{path}: an entry has no {name}. For the format see the head of docs/results.py.")
         files = raw["files"] if isinstance(raw["files"], dict) else dict.fromkeys(raw["files"], "")
         for name in files:
             if not (path.parent / name).is_file():
-                raise ValueError(f"{path}: files names {name}, which is not there.")
+                raise ValueError(f"{path}: files names {name}, which does not exist.")
         fills = raw.get("fills") or {}
         yield Entry(
             folder=path.parent,

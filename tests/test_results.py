@@ -147,9 +147,9 @@ def test_pictures_are_shown_and_numbers_linked(results, folder):
 @pytest.mark.parametrize(
     ("fields", "words"),
     [
-        ({"title": ""}, "an entry has no title. What one looks like: the head of docs/results.py"),
+        ({"title": ""}, "an entry has no title. For the format see the head of docs/results.py"),
         ({"files": {}}, "an entry has no files"),
-        ({"files": ["lost.png"]}, "files names lost.png, which is not there"),
+        ({"files": ["lost.png"]}, "files names lost.png, which does not exist"),
         ({"fills": ["ppo/c"]}, r"fills \['ppo/c'\]: not in planned.json"),
     ],
 )

@@ -88,19 +88,19 @@ class EnvConfig:
             ValueError: the message names the setting.
         """
         if self.suite not in SUITES:
-            raise ValueError(f"env.suite={self.suite}: there are {', '.join(SUITES)}.")
+            raise ValueError(f"env.suite={self.suite}: must be one of {', '.join(SUITES)}.")
         race, on_cuda = self.suite == "race", self.device.partition(":")[0] == "cuda"
         if not on_cuda and self.device != "cpu":
-            raise ValueError(f"env.device={self.device}: worlds live on cpu, cuda or cuda:1 ..., or auto.")
+            raise ValueError(f"env.device={self.device}: must be cpu, cuda, cuda:1 ..., or auto.")
         if on_cuda and not race:
             raise ValueError(f"env.device={self.device} is for races: env.suite={self.suite} runs on cpu.")
         if self.looks != "nominal" and not (race and self.from_pixels):
-            raise ValueError(f"env.looks={self.looks} is for races seen in images: leave it at nominal.")
+            raise ValueError(f"env.looks={self.looks} is for races with images: leave it at nominal.")
         if race:
             return
         for name, usual in vars(EnvConfig()).items():
             if name not in ALL_SUITES and (value := getattr(self, name)) != usual:
-                raise ValueError(f"env.{name}={value} is for races, and env.suite={self.suite}: leave it at {usual}.")
+                raise ValueError(f"env.{name}={value} is for races, but env.suite={self.suite}: leave it at {usual}.")
 
     def check_race(self, track: Track) -> None:
         """Refuse race settings that would fail later, when the environment is made.
@@ -109,7 +109,7 @@ class EnvConfig:
             ValueError: the message names the setting.
         """
         if self.camera_rate is not None and not self.from_pixels:
-            raise ValueError(f"env.camera_rate={self.camera_rate:g} is of images: leave it out of a run from numbers.")
+            raise ValueError(f"env.camera_rate={self.camera_rate:g} needs images: leave it out of runs without them.")
         try:
             at_control_rate(load_preset(self.preset), self.control_rate)
             frame_interval(Camera(rate=self.camera_rate), self.control_rate)
@@ -124,7 +124,7 @@ class EnvConfig:
         if self.reward is None and self.vector is None:
             return
         if self.vector is not None and self.imu_argument:
-            raise ValueError("vector and env.imu: agents see one set of numbers, leave one of them out.")
+            raise ValueError("vector and env.imu cannot be combined: leave one of them out.")
         own: dict[str, Any] = {name: getattr(self, name) for name in ("control_rate", "device", "reward", "vector")}
         worlds = RaceWorlds(track, 2, self.preset, from_pixels=False, **own)
         worlds.reset()

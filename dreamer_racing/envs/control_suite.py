@@ -149,7 +149,7 @@ class ControlSuiteEnv(EnvBase):
         expected = (len(self.worlds), self.worlds[0].action_size)
         if actions.shape != expected:
             raise ValueError(
-                f"Action of shape {actions.shape}: {expected[0]} world(s) of {self.task} take one of shape {expected}."
+                f"Action of shape {actions.shape}: must be {expected}, for {expected[0]} world(s) of {self.task}."
             )
         bad = np.flatnonzero(~np.isfinite(actions).all(axis=1))
         if len(bad):
@@ -199,8 +199,8 @@ class ControlSuiteEnv(EnvBase):
         states = state_dict["worlds"]
         if (state_dict["task"], len(states)) != (self.task, len(self.worlds)):
             raise ValueError(
-                f"The saved state is of {len(states)} world(s) of {state_dict['task']}, this environment has "
-                f"{len(self.worlds)} of {self.task}: make it with the same task and num_envs."
+                f"The saved state has {len(states)} world(s) of {state_dict['task']}, but this environment has "
+                f"{len(self.worlds)} of {self.task}: use the same task and num_envs."
             )
         self._free_worlds()
         for row, state in enumerate(states):
@@ -374,4 +374,4 @@ def _check_arguments(task: str, action_repeat: int, counts: Mapping[str, Any]) -
         if counts.get(name, 1) < 1:
             raise ValueError(f"{name}={counts[name]}: at least one {what} is needed.")
     if not isinstance(action_repeat, int) or action_repeat < 1:
-        raise ValueError(f"action_repeat={action_repeat!r}: a whole number of simulator steps, 1 or more.")
+        raise ValueError(f"action_repeat={action_repeat!r}: must be a whole number of simulator steps, at least 1.")

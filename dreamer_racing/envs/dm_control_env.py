@@ -207,8 +207,8 @@ class Physics(mujoco.Physics):
             TypeError: always; the message says what to do instead.
         """
         raise TypeError(
-            "This race cannot be copied or pickled: make another by load() with the same arguments. With the same "
-            "random= and the same actions it flies the same."
+            "This race cannot be copied or pickled: make another by load() with the same arguments. The same "
+            "random= and the same actions give the same flight."
         )
 
     def __reduce_ex__(self, protocol: Any) -> Any:
@@ -387,7 +387,7 @@ class DroneRace(base.Task):
             raise wrong_action_type(action.dtype)
         if action.shape != (ACTION_SIZE,):
             raise ValueError(
-                f"Action of shape {action.shape}: this environment takes one of shape ({ACTION_SIZE},): collective "
+                f"Action of shape {action.shape}: must be ({ACTION_SIZE},): collective "
                 "thrust and body rates x, y, z, each in [-1, 1]."
             )
         self._invalid_action = not np.isfinite(action).all()

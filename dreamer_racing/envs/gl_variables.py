@@ -48,7 +48,7 @@ def imports_with_variable(name: str) -> bool:
     setting = f"{variable}={refusal}"
     if setting not in unset_variables:
         package = name.partition(".")[0]
-        logger.warning("%s is left out of account: %s cannot be imported with it (%s).", setting, package, reason)
+        logger.warning("%s is ignored: %s cannot be imported with it (%s).", setting, package, reason)
     unset_variables[setting] = reason
     return False
 

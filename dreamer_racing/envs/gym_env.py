@@ -124,7 +124,7 @@ class GymWorlds:
         device = worlds.get("device", "cpu")
         if str(device).partition(":")[0] == "cuda":  # RaceWorlds refuses other devices
             raise ValueError(
-                f"device={device!r}: Gymnasium's arrays live on cpu; DroneRacingEnv keeps tensors on a GPU."
+                f"device={device!r}: must be cpu, where Gymnasium's arrays are; DroneRacingEnv keeps tensors on a GPU."
             )
         self.observation = observation
         self.privileged = privileged
@@ -183,8 +183,8 @@ class GymWorlds:
         """
         if mask is not None and not self.worlds.has_reset:
             raise gymnasium.error.ResetNeeded(
-                f"The first reset() begins {int(mask.sum())} of {len(mask)} episodes: reset all, without a reset_mask, "
-                "before a part."
+                f"The first reset() covers only {int(mask.sum())} of {len(mask)} episodes: first reset all of them, "
+                "without a reset_mask."
             )
         self.worlds.reset(None if mask is None else torch.from_numpy(mask))
 
@@ -213,7 +213,7 @@ class GymWorlds:
             return state
         pixels = self.worlds.render(None if mask is None else torch.from_numpy(mask)).numpy()
         if self.observation == "pixels_imu":
-            assert self.worlds.imu is not None, "made so"
+            assert self.worlds.imu is not None, "pixels_imu implies an IMU"
             return {"pixels": pixels, "imu": self.worlds.imu.sample.numpy()[rows]}
         if self.observation == "pixels_vector":
             return {"pixels": pixels, "vector": self.worlds.observed_vector().numpy()[rows]}
@@ -253,7 +253,7 @@ class GymWorlds:
             RendererUnavailableError: the chase view is chosen and there is no OpenGL.
         """
         if self._closed:
-            raise gymnasium.error.ClosedEnvironmentError("render() after close(): there is nothing left to draw with.")
+            raise gymnasium.error.ClosedEnvironmentError("render() after close(): the renderer is closed.")
         return self._seen_from_outside() if self._render_view == "chase" else self._seen_on_board()
 
     def _seen_from_outside(self) -> np.ndarray:
@@ -368,7 +368,7 @@ class DroneRaceGymEnv(gymnasium.Env[Observation, np.ndarray]):
         """
         if np.shape(action) != (ACTION_SIZE,):
             raise ValueError(
-                f"Action of shape {np.shape(action)}: this environment takes one of shape ({ACTION_SIZE},): collective "
+                f"Action of shape {np.shape(action)}: must be ({ACTION_SIZE},): collective "
                 "thrust and body rates x, y, z, each in [-1, 1]."
             )
         outcome, reward = self.race.step(np.asarray(action)[None])

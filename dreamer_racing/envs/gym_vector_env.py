@@ -105,7 +105,7 @@ class DroneRaceVectorEnv(VectorEnv[Observation, np.ndarray, np.ndarray]):
             ValueError: the seed is a list, but all environments share one generator; or the mask is invalid.
         """
         if seed is not None and not isinstance(seed, int | np.integer):
-            raise ValueError(f"seed={seed!r}: one number seeds all {self.num_envs} environments together.")
+            raise ValueError(f"seed={seed!r}: must be one number, for all {self.num_envs} environments together.")
         mask = self._reset_mask(options)
         super().reset(seed=seed)
         if seed is not None:
@@ -127,7 +127,7 @@ class DroneRaceVectorEnv(VectorEnv[Observation, np.ndarray, np.ndarray]):
         begun = self._ended
         if begun.any() and self.autoreset_mode is AutoresetMode.DISABLED:
             where = begun.nonzero()[0].tolist()
-            raise gymnasium.error.ResetNeeded(f"step() where episodes have ended, {where}: reset them by a reset_mask.")
+            raise gymnasium.error.ResetNeeded(f"Episodes {where} have ended: reset them by a reset_mask before step().")
         outcome, reward = self.race.step(actions)
         if begun.any():
             self.race.begin(begun)
@@ -158,7 +158,7 @@ class DroneRaceVectorEnv(VectorEnv[Observation, np.ndarray, np.ndarray]):
     def _reset_mask(self, options: dict[str, Any] | None) -> np.ndarray:
         mask = (options or {}).get("reset_mask", np.ones(self.num_envs, dtype=bool))
         if getattr(mask, "dtype", None) != np.bool_ or mask.shape != (self.num_envs,) or not mask.any():
-            raise ValueError(f"reset_mask={mask!r}: an array of {self.num_envs} bool, one of them true at least.")
+            raise ValueError(f"reset_mask={mask!r}: must be an array of {self.num_envs} bool, with at least one true.")
         return mask
 
     def _final(self, observation: Observation, ended: np.ndarray) -> dict[str, np.ndarray]:

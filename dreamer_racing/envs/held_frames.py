@@ -46,7 +46,7 @@ class FrameHold:
 
     def show(self, rows: Tensor | None) -> Tensor:
         """Return copies of the held images (M, height, width, 3): of all worlds, a mask (N,) bool or indices (M,)."""
-        assert self._images is not None, "an episode has begun"
+        assert self._images is not None, "reset() comes first"
         return self._images.clone() if rows is None else self._images[rows]
 
     def state_dict(self) -> dict[str, Any]:

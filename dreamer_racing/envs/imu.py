@@ -64,7 +64,7 @@ def load_imu(imu: str | ImuErrors | None, from_pixels: bool = True) -> ImuErrors
     if imu is None:
         return None
     if not from_pixels:
-        raise ValueError(f"imu={quoted(imu)}: is seen beside images, and from_pixels=False shows none: leave it out.")
+        raise ValueError(f"imu={quoted(imu)}: needs images, but from_pixels=False: leave it out.")
     if isinstance(imu, ImuErrors):
         return imu
     if not isinstance(imu, str) or imu not in IMUS:

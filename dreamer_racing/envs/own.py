@@ -116,7 +116,7 @@ class CustomFunction:
         found = import_own(given, f"{argument}={given}") if isinstance(given, str) and ":" in given else given
         found = found() if isinstance(found, type) else found
         if not callable(found):
-            raise ValueError(f"{argument}={quoted(given)}: must be a function of your own, or module:function of one.")
+            raise ValueError(f"{argument}={quoted(given)}: must be a function, or its name as module:function.")
         self.name = (
             f"{argument}={given if isinstance(given, str) else getattr(found, '__name__', type(found).__name__)}"
         )

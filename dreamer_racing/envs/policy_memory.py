@@ -23,7 +23,7 @@ def with_memory(env: EnvBase, primer: Transform) -> TransformedEnv:
         torch.Size([2, 8])
     """
     if not isinstance(primer, Transform):
-        raise TypeError(f"with_memory takes policy.make_primer(), a transform, and no {type(primer).__name__}.")
+        raise TypeError(f"with_memory needs a transform, policy.make_primer(), not {type(primer).__name__}.")
     in_place = isinstance(env, DroneRacingEnv) and _begins_with_zeros(primer)
     return (RaceWithMemory if in_place else TransformedEnv)(env, Compose(InitTracker(), primer))
 

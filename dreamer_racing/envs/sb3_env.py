@@ -18,8 +18,8 @@ from dreamer_racing.envs.tracks import Track
 from dreamer_racing.envs.worlds import WorldOptions, check_options
 
 _ONE_OBJECT = (
-    "the drones of DroneRaceVecEnv share one object, so that there is none to each. Arguments go to its constructor; "
-    "what may change meanwhile is `race.body_rate_weight`, for all of them."
+    "the drones of DroneRaceVecEnv share one object, so nothing can be set or called for each. Pass arguments to its "
+    "constructor; later only `race.body_rate_weight` can be changed, for all drones together."
 )
 
 

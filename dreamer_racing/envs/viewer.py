@@ -178,7 +178,7 @@ def check_viewer(environment: Mapping[str, str] = os.environ) -> None:
     chosen = environment.get("MUJOCO_GL", "").lower()
     windowless = []
     if chosen not in ("", "glfw", "enable", "enabled", "on", "true", "1"):
-        windowless.append(f"MUJOCO_GL={chosen} chooses drawing without a window (unset it, or MUJOCO_GL=glfw)")
+        windowless.append(f"MUJOCO_GL={chosen} selects rendering without a window (unset it, or set MUJOCO_GL=glfw)")
     try:
         check_window(environment, windowless)
     except ViewerUnavailableError as error:

@@ -103,7 +103,7 @@ def check_options(environment: type, given: Mapping[str, object], options: type)
     known = [*own, *options.__annotations__]
     for name in given:
         if name not in known:
-            images = "; observation= says whether images are drawn" if name == "from_pixels" else ""
+            images = "; observation= chooses whether images are rendered" if name == "from_pixels" else ""
             raise TypeError(
                 f"{environment.__name__} got an unexpected keyword argument {name!r}{suggestion(name, known)}{images}. "
                 f"It takes {', '.join(known)}."
@@ -242,7 +242,7 @@ class RaceWorlds:
     def _make_numbers(self, errors: ImuErrors | None, vector: str | VectorFunction | None) -> None:
         """Make the sources of vector observations: the IMU, and the race vector or a user-defined function."""
         if vector is not None and errors is not None:
-            raise ValueError("imu= and vector=: agents see one set of numbers, leave one of them out.")
+            raise ValueError("imu= and vector= cannot be combined: leave one of them out.")
         self.imu = None if errors is None else Imu(errors, self.simulator.ideal_imu, self._generator)
         self.race_vector = RaceVector(self.track, self.device, self.dtype)
         self._states = RaceStates(self.race, self.race_vector)
@@ -264,7 +264,7 @@ class RaceWorlds:
         shares = {"start_beyond_gate": beyond_gate, "start_at_gate": at_gate, "start_on_line": on_line}
         check_numbers({}, {**shares, "start_noise": noise})
         if not 0.0 <= on_line <= 1.0:
-            raise ValueError(f"start_on_line={on_line}: a share of episodes lies between 0 and 1.")
+            raise ValueError(f"start_on_line={on_line}: must be a share of episodes, from 0 to 1.")
         on_line = 0.0 if self.evaluation else on_line
         line = None
         if on_line:
@@ -308,8 +308,8 @@ class RaceWorlds:
         """Refuse to run in a forked child, which lacks the worker threads and would wait for them for ever."""
         if os.getpid() != self._process:
             raise RuntimeError(
-                f"These worlds were made in process {self._process}, and process {os.getpid()} was forked from it, "
-                "without the threads that fly and draw them: make them in the process that uses them, or start it by "
+                f"These worlds were made in process {self._process}. Process {os.getpid()} was forked from it and "
+                "lacks its worker threads: make the worlds in the process that uses them, or start that process by "
                 "multiprocessing's 'spawn'."
             )
 
@@ -357,11 +357,11 @@ class RaceWorlds:
         action = action.detach()  # delayed commands would otherwise keep all previous autograd graphs
         if action.shape != (self.num_envs, ACTION_SIZE):
             raise ValueError(
-                f"Action of shape {tuple(action.shape)}: {self.num_envs} environment(s) take one of shape "
-                f"({self.num_envs}, {ACTION_SIZE}): collective thrust and body rates x, y, z, each in [-1, 1]."
+                f"Action of shape {tuple(action.shape)}: must be ({self.num_envs}, {ACTION_SIZE}), for "
+                f"{self.num_envs} environment(s): collective thrust and body rates x, y, z, each in [-1, 1]."
             )
         if action.device != self.device:
-            raise ValueError(f"Action on {action.device}: these worlds live on {self.device}, and so must it.")
+            raise ValueError(f"Action on {action.device}: must be on {self.device}, like these worlds.")
         outcome = self._fly(action) if self.device.type != "cuda" else self._replay(action)
         if self._held is not None:
             self._held.step()
@@ -415,8 +415,8 @@ class RaceWorlds:
             if self.custom_reward is None or is_out_of_memory(error):
                 raise
             raise RuntimeError(
-                f"{self.custom_reward.name} cannot be captured as a CUDA graph. It must compute with tensors alone: no "
-                f".item(), no if on a number, no index by a mask, no tensor of Python's numbers. CUDA says: {error}"
+                f"{self.custom_reward.name} cannot be captured as a CUDA graph. It must use tensor operations only: no "
+                f".item(), no if on a tensor, no indexing by a mask, no tensor of Python numbers. CUDA says: {error}"
             ) from error
         self.load_state_dict(before)
         return graph
@@ -500,12 +500,12 @@ class RaceWorlds:
         saved = len(state_dict["race"]["target_gate"])
         if saved != self.num_envs:
             raise ValueError(
-                f"The saved state is of {saved} worlds, these are {self.num_envs}: resume with num_envs={saved}."
+                f"The saved state has {saved} worlds, but there are {self.num_envs} here: resume with num_envs={saved}."
             )
         if ("frames" in state_dict) != (self._held is not None):
-            raise ValueError("The saved worlds had another camera_rate than these: resume with theirs.")
+            raise ValueError("The saved worlds had another camera_rate: resume with the same one.")
         if ("imu" in state_dict) != (self.imu is not None):
-            raise ValueError("The saved worlds had another imu than these: resume with theirs.")
+            raise ValueError("The saved worlds had another imu: resume with the same one.")
         if self._tracks_last_action and "last_action" in state_dict:
             self._last_action.copy_(state_dict["last_action"])
         self.has_reset = True
@@ -513,7 +513,7 @@ class RaceWorlds:
         if generator.shape != self._generator.get_state().shape:
             saved_on = "cpu" if self.device.type == "cuda" else "cuda"
             raise ValueError(
-                f"The saved state is of worlds on {saved_on}, these are on {self.device.type}, whose random numbers "
+                f"The saved worlds were on {saved_on}, these are on {self.device.type}, where random numbers "
                 f"differ: resume with device={saved_on} (of the worlds; in recipes env.device={saved_on})."
             )
         self.simulator.load_state_dict(state_dict["simulator"])
@@ -528,8 +528,8 @@ class RaceWorlds:
     def __reduce_ex__(self, protocol: Any) -> Any:
         """Refuse to be copied or pickled, as simulators and their OpenGL contexts cannot be."""
         raise TypeError(
-            "Worlds cannot be copied or pickled: make others with the same arguments; the state of a DroneRacingEnv "
-            "goes from one to the other by state_dict() and load_state_dict()."
+            "Worlds cannot be copied or pickled: make new ones with the same arguments. To transfer the state of "
+            "a DroneRacingEnv, use state_dict() and load_state_dict()."
         )
 
     def close(self) -> None:

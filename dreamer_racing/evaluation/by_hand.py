@@ -111,7 +111,7 @@ def check_by_hand(kind: str, environment: Mapping[str, str] = os.environ) -> Non
     if sys.platform.startswith("linux") and not any(environment.get(name) for name in displays):
         raise ValueError(
             f"pilot={kind} needs a display to show what the camera sees, and neither DISPLAY nor WAYLAND_DISPLAY is "
-            "set: start it on a desktop, or over ssh -X. pilot=scripted flies without."
+            "set: start it on a desktop, or over ssh -X. pilot=scripted needs none."
         )
 
 
@@ -141,7 +141,7 @@ class PygameSticks:
         if kind == "gamepad":
             if not pygame.joystick.get_count():
                 pygame.quit()
-                raise ValueError("pilot=gamepad: there is no gamepad. Plug one in, or take pilot=keyboard.")
+                raise ValueError("pilot=gamepad: there is no gamepad. Plug one in, or use pilot=keyboard.")
             self._gamepad = pygame.joystick.Joystick(0)
         self._window = pygame.display.set_mode((WINDOW, WINDOW))
         pygame.display.set_caption("dreamer_racing: arrows, W A S D; escape ends")

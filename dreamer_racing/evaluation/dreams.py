@@ -82,7 +82,7 @@ class Dream:
                 context, frame_dt = int(file["context"]), float(file["frame_dt"])
                 from_pose = bool(file["from_pose"])
         except (ValueError, KeyError, EOFError, zipfile.BadZipFile, zlib.error) as error:
-            raise ValueError(f"{path} holds no dream, or half of one.") from error
+            raise ValueError(f"{path} holds no dream, or an incomplete one.") from error
         imagined = np.concatenate((reconstructed[:, :context], predicted), axis=1)
         return cls(real, reconstructed, imagined, context, frame_dt, from_pose)
 

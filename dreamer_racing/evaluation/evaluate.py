@@ -325,7 +325,7 @@ def _check(env: EnvBase, episodes: int) -> float:
     if episodes < 1:
         raise ValueError(f"episodes={episodes}: at least one episode is needed.")
     if len(env.batch_size) != 1:
-        raise ValueError(f"env has batch size {list(env.batch_size)}; evaluate() takes a batched one, [N].")
+        raise ValueError(f"env has batch size {list(env.batch_size)}; evaluate() needs one batch dimension, [N].")
     if not env.worlds.evaluation:
         raise ValueError(
             "env is a training environment: its episodes begin at random places and never finish. "
@@ -333,7 +333,7 @@ def _check(env: EnvBase, episodes: int) -> float:
         )
     if ("privileged", "linear_velocity") not in env.observation_spec.keys(include_nested=True):
         raise ValueError(
-            "env has no ('privileged', ...) entries, from which speed and paths are read: privileged=True."
+            "env has no ('privileged', ...) entries, which give speeds and paths: make it with privileged=True."
         )
     return float(env.worlds.parameters.control_dt)
 

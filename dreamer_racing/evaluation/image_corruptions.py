@@ -100,6 +100,6 @@ class CorruptedPolicy(torch.nn.Module):
         """
         pixels = tensordict.get("pixels", None)
         if pixels is None:
-            raise ValueError("corrupted images need a policy that sees: the environment has no 'pixels'.")
+            raise ValueError("image corruptions need images: the environment has no 'pixels'.")
         seen = tensordict.copy().set("pixels", self._corruption(pixels, tensordict["is_init"].flatten()))
         return self.policy(seen).set("pixels", pixels)

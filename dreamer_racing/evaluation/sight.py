@@ -138,7 +138,7 @@ def sight_table(flights: Mapping[str, Mapping[str, Sight]]) -> str:
     Args:
         flights: results of `measure_sight`, by the name of the kind of flight.
     """
-    head = ("flights", "looked at", "in view", "angle: mean", *(f"{level} %" for level in QUANTILES))
+    head = ("flights", "object", "in view", "angle: mean", *(f"{level} %" for level in QUANTILES))
     rows = [head, ("---",) * len(head)]
     for flight, sights in flights.items():
         for name, sight in sights.items():

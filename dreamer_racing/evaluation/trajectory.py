@@ -238,7 +238,7 @@ def read_trajectory(path: str | Path) -> tuple[Trajectory, Track]:
         steps = _columns(rows[:-1], list(range(len(expected), len(header))))
         control_dt, tilt = float(head["control_dt"]), float(head[TILT]) if TILT in head else None
     except ValueError as error:
-        raise ValueError(f"{path} holds a cell that is no number: {error}.") from error
+        raise ValueError(f"{path} has a cell that is not a number: {error}.") from error
     gate = numbers.pop("target_gate").flatten().long()
     judged = header[-1] == VALUE
     trajectory = Trajectory(
@@ -306,11 +306,11 @@ def read_flight(path: str | Path) -> tuple[Trajectory, Track]:
         with np.load(images) as file:
             pixels = torch.from_numpy(file["pixels"])
     except (ValueError, KeyError, EOFError, zipfile.BadZipFile, zlib.error) as error:
-        raise ValueError(f"{images} holds no images of a flight, or half of them: {error}.") from error
+        raise ValueError(f"{images} holds no images of a flight, or only some of them: {error}.") from error
     if pixels.ndim != 4 or len(pixels) != len(trajectory.position) or pixels.dtype != torch.uint8:
         raise ValueError(
             f"{images} holds {tuple(pixels.shape)} {pixels.dtype}, but {path} has {len(trajectory.position)} rows: "
-            "these files are of two flights."
+            "these files are from different flights."
         )
     return replace(trajectory, pixels=pixels), track
 

@@ -60,10 +60,10 @@ class Comparison:
     @property
     def caption(self) -> str:
         """Explanation of the numbers."""
-        of = f"{self.axis} that every variant has had" if axis_of(self.axis).clock else "longest run's env_steps"
+        of = f"{self.axis} that every variant reached" if axis_of(self.axis).clock else "longest run's env_steps"
         return (
             "Mean ± sample standard deviation (n − 1) over seeds, each the mean of what it logged within the last "
-            f"{100 * LAST_SHARE:.0f} % of the {of}. Evaluations are paid at b₂ = 0."
+            f"{100 * LAST_SHARE:.0f} % of the {of}. Evaluations use rewards with b₂ = 0."
         )
 
 
@@ -109,7 +109,7 @@ def _short_windows(ends: Mapping[tuple[str, str], Sequence[float]], axis: str) -
         return []
     form = axis_of(axis).form
     return [
-        f"{algorithm} {track}: compared up to {min(last):{form}} {axis}, where the first variant ends, "
+        f"{algorithm} {track}: compared up to {min(last):{form}} {axis}, where the shortest variant ends, "
         f"of {max(last):{form}}"
         for (track, algorithm), last in ends.items()
         if min(last) < ENDS_EARLY * max(last)
@@ -118,8 +118,8 @@ def _short_windows(ends: Mapping[tuple[str, str], Sequence[float]], axis: str) -
 
 def _ends_early(run: RunData, first: float, last: float, axis: str) -> str:
     form = axis_of(axis).form
-    what = "left out" if _end(run) < first else "it counts as far as it goes"
-    return f"{run.name} ends at {_end(run):{form}} {axis}, compared are {first:{form}} to {last:{form}}: {what}"
+    what = "left out" if _end(run) < first else "used up to its end"
+    return f"{run.name} ends at {_end(run):{form}} {axis}, but {first:{form}} to {last:{form}} are compared: {what}"
 
 
 def _result(key: CurveKey, group: Sequence[RunData], window: tuple[float, float]) -> VariantResult:

@@ -20,7 +20,7 @@ from dreamer_racing.figures.runs import AXES, CurveKey, RunData, along, axis_of,
 CURVES = "learning_curves.csv"
 POINTS = 240  # P
 WINDOW_SHARE = 0.02  # default window of the running mean, as a share of the longest run
-GAPS = "where an evaluation left no value, mean of the seeds that have one, and nothing where fewer than half do"
+GAPS = "where a seed has no value, the mean of the others; a gap where fewer than half of the seeds have one"
 ENDS_EARLY = 0.98  # runs that end before this share of a curve's longest run are reported
 WEIGHT = "curriculum/body_rate_weight"
 ALL_TRACKS = "all tracks"
@@ -103,7 +103,7 @@ def wanted_columns(quantities: Sequence[str], axis: str = "env_steps") -> list[s
     clock = axis_of(axis).clock
     for name in quantities:
         if name not in QUANTITIES:
-            raise ValueError(f"quantities={name}: there are {', '.join(QUANTITIES)}.")
+            raise ValueError(f"quantities={name}: must be one of {', '.join(QUANTITIES)}.")
     columns = [QUANTITIES[name].column for name in quantities]
     beside = [name for column in columns for name in _presence(column)]
     return [*dict.fromkeys([*columns, *beside, WEIGHT, *([clock] if clock else [])])]
@@ -138,7 +138,7 @@ def learning_curves(
     """
     wanted_columns(quantities, axis)
     if aggregate not in AGGREGATES:
-        raise ValueError(f"aggregate={aggregate}: there are {', '.join(AGGREGATES)}.")
+        raise ValueError(f"aggregate={aggregate}: must be one of {', '.join(AGGREGATES)}.")
     if not runs:
         raise ValueError(f"there is no run to draw. {'; '.join(problems) or 'None was given.'}")
     runs, without_clock = along(runs, axis)
@@ -331,7 +331,7 @@ def _short_runs(groups: dict[CurveKey, list[RunData]], axis: str) -> list[str]:
     for group in groups.values():
         ends = [run.metrics.env_steps.max(initial=0) for run in group]
         lines += [
-            f"{run.name} ends at {end:{form}} of {max(ends):{form}} {axis}: fewer seeds from there"
+            f"{run.name} ends at {end:{form}} of {max(ends):{form}} {axis}: fewer seeds after that"
             for run, end in zip(group, ends, strict=True)
             if end < ENDS_EARLY * max(ends)
         ]

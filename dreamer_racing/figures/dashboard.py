@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 
 LOOPBACK = "127.0.0.1"
 """Servers listen on the loopback interface only."""
-KEYS = "Space plays and pauses, comma and full stop go a step back and on; a click on a curve goes there."
+KEYS = "Space: play or pause. Comma or full stop: one step back or forward. Click on a curve: go to that time."
 HOLD = 1.0  # s that the last frame is held before the recording repeats
 
 

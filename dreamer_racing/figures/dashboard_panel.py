@@ -66,7 +66,7 @@ TRACES = (
     Trace("roll rate", "rad/s", command(1)),
     Trace("pitch rate", "rad/s", command(2)),
     Trace("yaw rate", "rad/s", command(3)),
-    Trace("value", "return expected", lambda flight: None if flight.value is None else flight.value.numpy()),
+    Trace("value", "expected return", lambda flight: None if flight.value is None else flight.value.numpy()),
 )
 """The curves of a page: speed, the actor's four commands, and the critic's value."""
 
@@ -90,7 +90,7 @@ def missing(flight: ShownFlight) -> Iterator[str]:
     if flight.trajectory.pixels is None:
         yield f"{flight.title}: no images, because none were recorded with the flight."
     if flight.trajectory.value is None:
-        yield f"{flight.title}: no value, because no critic judged the flight; agents that ship have none."
+        yield f"{flight.title}: no value, because the flight has no critic; included agents have none."
 
 
 def readings(track: Track, flights: Sequence[ShownFlight]) -> dict[str, Any]:

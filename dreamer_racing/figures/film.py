@@ -94,7 +94,7 @@ def _finds_ffmpeg() -> bool:
 
         imageio_ffmpeg.get_ffmpeg_exe()
     except (ImportError, RuntimeError) as error:
-        logger.warning("no videos are written: %s. pip install imageio-ffmpeg brings ffmpeg.", str(error).rstrip("."))
+        logger.warning("no videos are written: %s. For ffmpeg: pip install imageio-ffmpeg.", str(error).rstrip("."))
         return False
     return True
 
@@ -294,7 +294,7 @@ def _as_frames(frames: np.ndarray | torch.Tensor, name: str) -> np.ndarray:
     array = frames.detach().cpu().numpy() if isinstance(frames, torch.Tensor) else frames
     if array.ndim != 4 or array.shape[-1] != 3 or not array.size or array.dtype != np.uint8:
         raise ValueError(
-            f"{name} is {array.dtype} of shape {array.shape}; wanted: uint8 (T, H, W, 3), at least 1 frame."
+            f"{name} is {array.dtype} of shape {array.shape}; must be uint8 (T, H, W, 3), at least 1 frame."
         )
     return array
 

@@ -70,7 +70,7 @@ def plot_flights(
     if not flights:
         raise ValueError("no flights to draw.")
     if over not in PROFILE_AXES:
-        raise ValueError(f"over={over}: there are {', '.join(PROFILE_AXES)}.")
+        raise ValueError(f"over={over}: must be one of {', '.join(PROFILE_AXES)}.")
     columns = min(columns, len(flights))
     rows = math.ceil(len(flights) / columns)
     half = [max(size) / 2 for size in zip(*(_hall(flight.track) for flight in flights), strict=True)]  # m
@@ -165,7 +165,7 @@ def plot_dreams(
     square: dict[str, Any] = {"marker": "s", "linestyle": "", "markersize": 7}
     phases = (
         (CONTEXT_COLOR, "the model has seen this image"),
-        (OPEN_LOOP_COLOR, "predicted from actions alone, since 0 s"),
+        (OPEN_LOOP_COLOR, "predicted from actions alone, from 0 s on"),
     )
     handles = [
         Line2D([], [], color=(red / 255, green / 255, blue / 255), label=label, **square)

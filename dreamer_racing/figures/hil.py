@@ -126,12 +126,12 @@ def _make_report(flight: FlownFlight, passes: list[GatePass], response: dict[str
     """Return the content of report.json without figures and the flights' summaries."""
     config, ticks = flight.about.get("config") or {}, flight.time[flight.flown]
     began = float(ticks[0]) if len(ticks) else 0.0
-    problems = [] if flight.whole else ["the file was not finished: the loop was killed, or it flies still"]
+    problems = [] if flight.whole else ["the file is incomplete: the loop was killed, or is still running"]
     if not flight.holds_track:
-        problems.append(f"the recording does not hold its track: {flight.track.name} is taken as it is now")
+        problems.append(f"the recording does not contain its track: today's {flight.track.name} is used")
     counted = int(flight.passes.max())
     if counted != len(passes):
-        problems.append(f"the loop counted {counted} gates, and the recorded poses give {len(passes)}")
+        problems.append(f"the loop counted {counted} gates, but the recorded poses give {len(passes)}")
     return {
         "flight": str(flight.path),
         "track": flight.track.name,
@@ -205,13 +205,13 @@ def _draw_tracking(
     figure = Figure(figsize=(9.0, 1.75 * len(response) + 0.5), layout="constrained")
     panels = figure.subplots(len(response), 1, sharex=True, squeeze=False)[:, 0]
     for axes, (name, (asked_time, asked, time, measured)) in zip(panels, response.items(), strict=True):
-        axes.step(asked_time - began, asked, where="post", color=ASKED_COLOR, linewidth=0.9, label="asked for")
+        axes.step(asked_time - began, asked, where="post", color=ASKED_COLOR, linewidth=0.9, label="commanded")
         axes.plot(time - began, measured, color=MEASURED_COLOR, linewidth=1.2, alpha=0.85, label="measured")
         axes.set_ylabel(LABELS[name], fontsize=8)
         axes.set_title(_error_in_words(name, errors[name]), loc="left", fontsize=8, color=MUTED)
         dress(axes)
     figure.align_ylabels(panels)
-    panels[-1].set_xlabel("time since arming (s); thrust is measured from velocities, less drag")
+    panels[-1].set_xlabel("time since arming (s); thrust is measured from velocities and includes drag")
     handles, labels = panels[0].get_legend_handles_labels()
     figure.legend(handles, labels, loc="outside lower left", ncols=2, frameon=False, fontsize=8)
     save(figure, path)
@@ -219,9 +219,9 @@ def _draw_tracking(
 
 def _error_in_words(name: str, error: dict[str, float | None] | None) -> str:
     if error is None:
-        return "too little was measured for an error"
-    lag = "the command never changes" if error["lag_ms"] is None else f"at a lag of {error['lag_ms']:.0f} ms"
-    return f"RMS error {error['rms']:.3g} {CHANNELS[name]}, {lag} ({error['rms_without_lag']:.3g} without)"
+        return "too few measurements for an error"
+    lag = "no lag, as the command is constant" if error["lag_ms"] is None else f"at a lag of {error['lag_ms']:.0f} ms"
+    return f"RMS error {error['rms']:.3g} {CHANNELS[name]}, {lag} ({error['rms_without_lag']:.3g} without lag)"
 
 
 def _lines(report: dict[str, Any]) -> list[str]:
@@ -235,12 +235,12 @@ def _lines(report: dict[str, Any]) -> list[str]:
         if row is not None:
             lines.append(f"  {name:<11} p50 {row['p50_ms']:7.2f}   p99 {row['p99_ms']:7.2f}   max {row['max_ms']:7.2f}")
     offsets = [passed["offset_m"] for passed in report["gates"]]
-    middle = f", {np.mean(offsets):.2f} m from the centre in the mean, {max(offsets):.2f} m at most" if offsets else ""
+    middle = f", {np.mean(offsets):.2f} m from the centre on average, {max(offsets):.2f} m at most" if offsets else ""
     lines.append(f"gates passed: {len(offsets)}{middle}")
     lines += [f"laps ({name}): {_seconds(laps)}" for name, laps in report["laps_s"].items() if laps]
     lines += [f"{name}: {_error_in_words(name, error)}" for name, error in report["tracking"].items() if error]
     lines += [
-        f"{name}: up to {flight['speed_max']:.1f} m/s, {flight['speed_mean']:.1f} in the mean, "
+        f"{name}: up to {flight['speed_max']:.1f} m/s, {flight['speed_mean']:.1f} on average, "
         f"{flight['gates']} gates in {flight['duration_s']:.2f} s"
         for name, flight in (("flown", report.get("flown")), ("against", report.get("against")))
         if flight

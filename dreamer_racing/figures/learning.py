@@ -170,12 +170,12 @@ def _draw_legend(axes: Axes, handles: Sequence[Line2D], caption: str, columns: i
 def _caption(curves: LearningCurves, styles: Styles) -> str:
     """Return a caption that names the aggregate, the band and the window."""
     centre, band = BANDS[curves.aggregate]
-    of = " of the default alone" if any(_crowded(key, styles) for key in styles) else ""
+    of = " of the default only" if any(_crowded(key, styles) for key in styles) else ""
     window = f"{curves.window:.2g}"
     if not axis_of(curves.axis).clock:
         window = EngFormatter(sep="")(float(window))  # 24k, 1.5M
     over = f"running mean over {window} {axis_of(curves.axis).label}"
-    return f"{centre} over seeds, and {band}{of} (none of one seed); {over}"
+    return f"{centre} over seeds; band: {band}{of} (none for one seed); {over}"
 
 
 def _seed_count(curves: LearningCurves, key: CurveKey) -> str:
@@ -225,7 +225,7 @@ def _line_style(key: CurveKey, own: Sequence[CurveKey]) -> dict[str, Any]:
     lines, shades = len(VARIANT_LINES), len(VARIANT_SHADES)
     if len(own) > lines * shades:
         raise ValueError(
-            f"{len(own)} variants of {key.algorithm}: a figure can tell {lines * shades} apart. Draw them in several "
+            f"{len(own)} variants of {key.algorithm}: a figure can show at most {lines * shades}. Draw several "
             "figures: runs=[...] takes folders and patterns."
         )
     index = own.index(key)

@@ -93,7 +93,7 @@ def draw(config: PlotConfig) -> None:
     if len(places) == 1 and (file := curves_file(places[0])):
         refuse_for_curves(config)
         draw_curves(read_curves(file), output)
-        logger.info("learning_curves:  learning_curves.png, of the quantities and statistics that the file holds")
+        logger.info("learning_curves:  learning_curves.png, with the quantities and statistics of the file")
         return
     named = [name for name, files in (("trajectories", config.flights), ("imagined", config.dreams)) if files]
     asked = list(FIGURES) if config.figure == "all" else [config.figure]
@@ -105,7 +105,7 @@ def draw(config: PlotConfig) -> None:
     if config.figure == "all":
         draw_all(config, output, runs, problems, asked)
     elif not draw_one(config.figure, config, output, runs, problems):
-        raise ValueError(f"figure={config.figure}: none of these runs has stored anything for it.")
+        raise ValueError(f"figure={config.figure}: none of these runs has data for it.")
 
 
 def as_list(value: Any) -> list[str]:
@@ -125,8 +125,8 @@ def refuse_for_curves(config: PlotConfig) -> None:
         given.append("figure")
     if given:
         raise ValueError(
-            f"{', '.join(f'{name}=' for name in given)}: runs={config.runs} is a file of curves, which is drawn as it "
-            "is. Leave it out, or name runs."
+            f"{', '.join(f'{name}=' for name in given)}: runs={config.runs} is a file of curves, which is drawn "
+            "unchanged. Leave the setting out, or name runs."
         )
 
 
@@ -143,7 +143,7 @@ def check_plot(config: PlotConfig) -> None:
         ("over", config.over, PROFILE_AXES),
     ):
         if value not in allowed:
-            raise ValueError(f"{name}={value}: there are {', '.join(allowed)}.")
+            raise ValueError(f"{name}={value}: must be one of {', '.join(allowed)}.")
     for name, files in (("flights", config.flights), ("dreams", config.dreams)):
         if missing := [str(file) for file in files if not Path(file).is_file()]:
             raise ValueError(f"{name}={missing[0]}: there is no such file.")
@@ -170,14 +170,14 @@ def draw_all(config: PlotConfig, output: Path, runs: list[RunData], problems: li
         raise defects[0]
     if not drawn:
         reasons = "\n".join(f"figure={name}: {failure}" for name, failure in failures.items())
-        raise ValueError(f"figure=all: nothing could be drawn. {reasons or 'These runs have stored nothing for it.'}")
+        raise ValueError(f"figure=all: nothing could be drawn. {reasons or 'These runs have no data for it.'}")
 
 
 def draw_one(name: str, config: PlotConfig, output: Path, runs: list[RunData], problems: list[str]) -> bool:
     """Draw a figure and log what it has left out; return whether there was data."""
     files, found = FIGURES[name].draw(config, output, runs, problems)
     warn([problem for problem in found if problem not in problems])
-    logger.info("%-17s %s", f"{name}:", ", ".join(files) or "none of these runs has stored anything for it")
+    logger.info("%-17s %s", f"{name}:", ", ".join(files) or "none of these runs has data for it")
     return bool(files)
 
 
@@ -296,7 +296,7 @@ def draw_comparison(config: PlotConfig, output: Path, runs: list[RunData], probl
     """Write `comparison.md` and `comparison.png`, if there are variants to compare."""
     if len(group_runs(runs)) < 2:
         if runs and config.figure == "comparison":
-            raise ValueError("figure=comparison: these runs are of one variant; runs= takes several paths.")
+            raise ValueError("figure=comparison: these runs have only one variant; runs= takes several paths.")
         return Drawn([], [])
     comparison = compare_variants(runs, problems, config.axis)
     (output / "comparison.md").write_text(comparison_table(comparison), encoding="utf-8")

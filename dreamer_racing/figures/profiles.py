@@ -120,7 +120,7 @@ def altitude_legend(flights: Sequence[tuple[Track, Trajectory]]) -> list[Line2D]
     if True in passed:
         handles.append(Line2D([], [], color=GATE_COLOR, label="frame, passed", **_IN_LEGEND))
     if False in passed:
-        handles.append(Line2D([], [], color=MISSED_COLOR, label="above, below or out of turn", **_IN_LEGEND))
+        handles.append(Line2D([], [], color=MISSED_COLOR, label="above, below or out of order", **_IN_LEGEND))
     return handles
 
 

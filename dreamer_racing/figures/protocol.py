@@ -95,7 +95,7 @@ def plot_conditions(results: Sequence[Result], path: str | Path, title: str | No
     labels = [f"{condition.replace('_', ' ')}\n{preset}" for preset, condition in places]
     gates.set_xticks(range(len(places)), labels, fontsize=8)
     success.legend(frameon=False, fontsize=8, ncols=2, loc="upper right", bbox_to_anchor=(1.0, 1.16))
-    _note(figure, "Lines: 95 % interval over n different flights (Wilson's of success, normal of mean gates).")
+    _note(figure, "Lines: 95 % intervals over n different flights (success: Wilson, mean gates: normal).")
     _save(figure, path, title)
 
 

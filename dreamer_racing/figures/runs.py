@@ -63,7 +63,7 @@ def axis_of(name: str) -> Axis:
         ValueError: the name is unknown.
     """
     if name not in AXES:
-        raise ValueError(f"axis={name}: there are {', '.join(AXES)}.")
+        raise ValueError(f"axis={name}: must be one of {', '.join(AXES)}.")
     return AXES[name]
 
 
@@ -223,7 +223,7 @@ def _once_each(runs: Sequence[RunData], problems: list[str]) -> list[RunData]:
             *others, best = sorted(repeated, key=lambda run: run.metrics.env_steps.max(initial=0))
             kept.append(best)
             problems += [
-                f"{run.name} left out: it has the settings and the seed of {best.name}, which got as far or further"
+                f"{run.name} left out: same settings and seed as {best.name}, which has at least as many env_steps"
                 for run in others
             ]
     return kept
@@ -300,7 +300,7 @@ def along(runs: Sequence[RunData], axis: str) -> tuple[list[RunData], list[str]]
     kept, problems = [], []
     for run in runs:
         if clock not in run.metrics.columns:
-            problems.append(f"{run.name} left out: it has no {clock}, which {axis} are read off")
+            problems.append(f"{run.name} left out: it has no {clock}, which axis={axis} needs")
             continue
         hours = _hours(*run.metrics.columns[clock])
         columns = {name: (hours(steps), values) for name, (steps, values) in run.metrics.columns.items()}

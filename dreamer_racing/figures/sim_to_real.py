@@ -16,7 +16,7 @@ from dreamer_racing.figures.protocol import Bar, mean_bar, share_bar
 
 LABELS = {
     "delay": ("command delay (ms)", 1e3),
-    "latency": ("pose latency, not told (ms)", 1e3),
+    "latency": ("pose latency, unknown to the loop (ms)", 1e3),
     "mass": ("mass, relative", 1.0),
     "thrust": ("thrust, relative", 1.0),
     "position_noise": ("position noise (mm)", 1e3),
@@ -27,7 +27,7 @@ LABELS = {
 COLORS = ("#2f5fb3", "#e8590c", "#1fa2a6", "#7950f2")
 APART = 0.16
 """Horizontal offset between studies at one value, as a share of the step between values, against overlap."""
-NOTE = "Lines: 95 % interval over n flights (Wilson's of success, the normal one of mean laps). Values not to scale."
+NOTE = "Lines: 95 % intervals over n flights (success: Wilson, mean laps: normal). Horizontal axes are not to scale."
 
 
 def plot_study(results: Sequence[Mapping[str, Any]], path: str | Path) -> None:
@@ -44,7 +44,7 @@ def plot_study(results: Sequence[Mapping[str, Any]], path: str | Path) -> None:
     if not sweeps:
         raise ValueError("These studies hold no flight: there is nothing to draw.")
     if len(results) > len(COLORS):
-        raise ValueError(f"{len(results)} studies: no more than {len(COLORS)} go into one picture.")
+        raise ValueError(f"{len(results)} studies: at most {len(COLORS)} fit into one figure.")
     figure = Figure(figsize=(max(7.0, 2.6 * len(sweeps) + 0.6), 5.6), layout="constrained")
     panels: np.ndarray = figure.subplots(2, len(sweeps), sharex="col", sharey="row", squeeze=False)
     for column, sweep in zip(panels.T, sweeps, strict=True):

@@ -161,7 +161,7 @@ def test_frames_fall_on_control_steps(camera_rate: float | None, control_rate: f
     ("camera_rate", "words"),
     [
         (30, "camera_rate=30 Hz: must be control_rate=50 divided by a whole number.*: 25 or 50 are the nearest"),
-        (60, "camera_rate=60 Hz: at most control_rate=50"),
+        (60, "camera_rate=60 Hz: must be at most control_rate=50"),
         (0, "camera_rate=0: must be above 0"),
         ("25", "camera_rate='25': must be a number"),
         (float("nan"), "camera_rate=nan: must be above 0"),
@@ -176,5 +176,5 @@ def test_other_rates_are_refused(camera_rate: object, words: str) -> None:
 
 def test_without_images_there_is_no_rate_of_them() -> None:
     for make in (DroneRacingEnv, load):
-        with pytest.raises(ValueError, match="camera_rate=25: is of images, and from_pixels=False"):
+        with pytest.raises(ValueError, match="camera_rate=25: needs images, but from_pixels=False"):
             make("circle", from_pixels=False, camera_rate=25)

@@ -324,7 +324,7 @@ def test_resume_before_the_first_episode() -> None:
 
 def test_foreign_state_is_refused() -> None:
     state = blind(num_envs=2).state_dict()
-    with pytest.raises(ValueError, match="of 2 world.* of cartpole_swingup, this environment has 3 of walker_walk"):
+    with pytest.raises(ValueError, match="has 2 world.* of cartpole_swingup, but this environment has 3 of walker"):
         blind("walker_walk", 3).load_state_dict(state)
 
 
@@ -372,7 +372,7 @@ def test_bad_arguments_are_explained(opengl: None) -> None:
     with pytest.raises(ValueError, match="num_envs=0: at least one world"):
         blind(num_envs=0)
     for repeat in (0, 1.5):
-        with pytest.raises(ValueError, match=f"action_repeat={repeat}: a whole number"):
+        with pytest.raises(ValueError, match=f"action_repeat={repeat}: must be a whole number"):
             blind(action_repeat=repeat)
     for camera in (7, "nose"):
         with pytest.raises(ValueError, match=r"cartpole_swingup has the cameras 0 to 1, fixed, lookatcart"):
@@ -398,7 +398,7 @@ def test_counts_of_nothing_are_refused(argument: dict[str, object], words: str) 
 def test_bad_actions_are_explained() -> None:
     env = blind("walker_walk", 2)
     data = env.reset()
-    with pytest.raises(ValueError, match=r"shape \(2, 5\): 2 world\(s\) of walker_walk take one of shape \(2, 6\)"):
+    with pytest.raises(ValueError, match=r"shape \(2, 5\): must be \(2, 6\), for 2 world\(s\) of walker_walk"):
         env.step(data.clone().set("action", torch.zeros(2, 5)))
     action = torch.zeros(2, 6)
     action[1, 2] = torch.nan

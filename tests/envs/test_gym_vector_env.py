@@ -19,7 +19,7 @@ CLIMB = np.array([0.5, 0.0, 0.0, 0.0], np.float32)
 def test_a_part_cannot_begin_before_all_have() -> None:
     envs = make_vec(observation="state", autoreset_mode="Disabled")
     part = {"reset_mask": np.array([True, False, False])}
-    with pytest.raises(gymnasium.error.ResetNeeded, match=r"begins 1 of 3 episodes: reset all, without a reset_mask"):
+    with pytest.raises(gymnasium.error.ResetNeeded, match=r"covers only 1 of 3 episodes: first reset all of them"):
         envs.reset(seed=0, options=part)
     with pytest.raises(gymnasium.error.ResetNeeded, match="before the first reset"):
         envs.step(np.zeros((3, 4)))
@@ -200,7 +200,7 @@ def test_in_mode_disabled_episodes_begin_where_they_are_reset() -> None:
     envs = make_vec(observation="vector", autoreset_mode=AutoresetMode.DISABLED, evaluation=True)
     start, _ = envs.reset(seed=0)
     last, _, terminated, _, _ = make_and_poison(envs)
-    with pytest.raises(gymnasium.error.ResetNeeded, match=r"ended, \[1\]"):
+    with pytest.raises(gymnasium.error.ResetNeeded, match=r"Episodes \[1\] have ended"):
         envs.step(np.tile(HOVER, (3, 1)))
     observation, info = envs.reset(options={"reset_mask": terminated})
     np.testing.assert_allclose(observation[1], start[1], atol=1e-6)

@@ -211,7 +211,7 @@ def test_who_flies_on_feels_no_reset_of_another() -> None:
     [
         ({"imu": "perfect"}, "imu='perfect': must be exact, noisy, ImuErrors"),
         ({"imu": True}, "imu=True: must be exact"),
-        ({"imu": "exact", "from_pixels": False}, "imu='exact': is seen beside images"),
+        ({"imu": "exact", "from_pixels": False}, "imu='exact': needs images"),
     ],
 )
 def test_bad_values_are_refused(arguments: dict, words: str) -> None:

@@ -164,14 +164,14 @@ def uneven() -> Any:
         ({"reward": lambda step: torch.zeros(())}, r"shape \(\): must be \(3,\) or \(3, 1\), a reward for each drone"),
         ({"reward": lambda step: 1.0}, "returned float: must be a tensor on cpu"),
         ({"reward": lambda step: step.default_reward / 0}, "reward=<lambda> returned numbers that are not finite"),
-        ({"reward": "smooth"}, "reward='smooth': must be a function of your own, or module:function of one"),
+        ({"reward": "smooth"}, "reward='smooth': must be a function, or its name as module:function"),
         ({"reward": "no_such:smooth"}, r"reward=no_such:smooth was not found: there is no no_such\.py in"),
         ({"reward": "math:sqroot"}, r"module 'math' has no 'sqroot' \(did you mean sqrt\?\)"),
-        ({"vector": 3}, "vector=3: must be a function of your own"),
+        ({"vector": 3}, "vector=3: must be a function"),
         ({"vector": lambda state: state.time}, r"shape \(3,\): must be \(3, V\), V numbers for each drone"),
         ({"vector": lambda state: state.time[:, None] / 0}, "vector=<lambda> returned numbers that are not finite"),
         ({"vector": uneven()}, r"shape \(3, 3\): must be \(3, 2\), 2 numbers"),
-        ({"vector": OWN["gate_and_action"], "imu": "exact", "from_pixels": True}, "imu= and vector=: agents see one"),
+        ({"vector": OWN["gate_and_action"], "imu": "exact", "from_pixels": True}, "imu= and vector= cannot be"),
     ],
 )  # fmt: skip
 def test_bad_ones_are_refused(own: dict[str, Any], message: str) -> None:

@@ -119,7 +119,7 @@ def test_frames_and_attributes() -> None:
         env.set_attr("x", 1)
     with pytest.raises(NotImplementedError, match="env_method\\('close'\\)"):
         env.env_method("close")
-    with pytest.raises(ValueError, match=r"shape \(3, 4\): 2 environment\(s\) take one of shape \(2, 4\)"):
+    with pytest.raises(ValueError, match=r"shape \(3, 4\): must be \(2, 4\), for 2 environment\(s\)"):
         env.step(np.zeros((3, 4)))
     env.close()
     env.close()

@@ -239,7 +239,7 @@ def test_invalid_action_ends_only_its_own_environment() -> None:
 def test_wrong_action_shape_is_explained() -> None:
     env = blind()
     data = env.reset()
-    with pytest.raises(ValueError, match=r"Action of shape \(3, 3\): 3 environment\(s\) take one of shape \(3, 4\)"):
+    with pytest.raises(ValueError, match=r"Action of shape \(3, 3\): must be \(3, 4\), for 3 environment\(s\)"):
         env.step(data.set("action", torch.zeros(3, 3)))
 
 
@@ -253,7 +253,7 @@ def test_actions_that_are_no_fractions_are_refused(kind: torch.dtype) -> None:
 
 @pytest.mark.parametrize("copied", [copy.deepcopy, pickle.dumps])
 def test_an_environment_is_not_copied(copied: Callable[[object], object]) -> None:
-    with pytest.raises(TypeError, match=r"make others with the same arguments.*state_dict\(\)"):
+    with pytest.raises(TypeError, match=r"make new ones with the same arguments.*state_dict\(\)"):
         copied(blind())
 
 
@@ -303,7 +303,7 @@ def test_drones_together_fly_as_each_alone() -> None:
 def test_bad_arguments_are_explained() -> None:
     with pytest.raises(ValueError, match="num_envs=0: at least one world"):
         DroneRacingEnv(num_envs=0)
-    with pytest.raises(ValueError, match="preset=hard: there is no such physics; there are betaflight, easy, faithful"):
+    with pytest.raises(ValueError, match="preset=hard: must be one of betaflight, easy, faithful"):
         blind(preset="hard")
     with pytest.raises(TrackError, match="kidny"):
         blind(track="kidny")

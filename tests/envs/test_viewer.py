@@ -117,7 +117,7 @@ def test_viewer_without_display_says_what_is_missing(monkeypatch: pytest.MonkeyP
     with pytest.raises(viewer.ViewerUnavailableError, match="no display.*ssh -X") as caught:
         viewer.check_viewer({})
     assert "\n" not in str(caught.value)
-    with pytest.raises(viewer.ViewerUnavailableError, match="MUJOCO_GL=egl chooses drawing without a window"):
+    with pytest.raises(viewer.ViewerUnavailableError, match="MUJOCO_GL=egl selects rendering without a window"):
         viewer.check_viewer({"DISPLAY": ":0", "MUJOCO_GL": "egl"})
 
 

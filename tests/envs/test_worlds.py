@@ -92,7 +92,7 @@ def test_an_action_on_another_device_is_refused(lives: str, acts: str) -> None:
     worlds.device = torch.device(lives)
     with FakeTensorMode():
         action = torch.zeros(2, 4, device=acts)
-        with pytest.raises(ValueError, match=f"Action on {acts}: these worlds live on {lives}"):
+        with pytest.raises(ValueError, match=f"Action on {acts}: must be on {lives}"):
             worlds.step(action)
 
 
@@ -151,7 +151,7 @@ def test_images_are_drawn_whatever_mujoco_gl_says(tmp_path: Path, value: str) ->
     )
     done = run(["-c", program], tmp_path, MUJOCO_GL=value)
     assert done.returncode == 0 and "64" in done.stdout, done.stderr
-    assert done.stderr.count(f"MUJOCO_GL={value} is left out of account") == 1
+    assert done.stderr.count(f"MUJOCO_GL={value} is ignored") == 1
 
 
 def test_a_training_begins_whatever_mujoco_gl_says(tmp_path: Path) -> None:
@@ -159,7 +159,7 @@ def test_a_training_begins_whatever_mujoco_gl_says(tmp_path: Path) -> None:
     program = [str(ROOT / "recipes" / "dreamer_v3.py"), "model=debug", "total_env_steps=1"]
     done = run(program, tmp_path, MUJOCO_GL="no_such_thing")
     assert done.returncode == 2 and "Traceback" not in done.stderr and "prefill" in done.stderr, done.stderr
-    assert done.stderr.count("MUJOCO_GL=no_such_thing is left out of account") == 1
+    assert done.stderr.count("MUJOCO_GL=no_such_thing is ignored") == 1
 
 
 def test_whatever_imports_torchrl_has_heeded_the_variable_before() -> None:
@@ -191,7 +191,7 @@ def test_dm_control_draws_whatever_pyopengl_platform_says(tmp_path: Path, word: 
     program = "from dreamer_racing.envs import load; print(load('circle', from_pixels=True).reset().observation.keys())"
     done = run(["-c", program], tmp_path, MUJOCO_GL=word, PYOPENGL_PLATFORM="glx")
     assert done.returncode == 0 and "pixels" in done.stdout, done.stderr
-    assert done.stderr.count("PYOPENGL_PLATFORM=glx is left out of account") == 1
+    assert done.stderr.count("PYOPENGL_PLATFORM=glx is ignored") == 1
 
 
 def test_dm_control_does_without_opengl_where_none_of_it_can_be_imported(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -314,7 +314,7 @@ def test_transforms_that_are_appended_see_episodes_begin() -> None:
 
 
 def test_a_policy_in_place_of_its_primer_is_refused() -> None:
-    with pytest.raises(TypeError, match=r"with_memory takes policy.make_primer\(\), a transform, and no Linear"):
+    with pytest.raises(TypeError, match=r"with_memory needs a transform, policy.make_primer\(\), not Linear"):
         with_memory(make(from_pixels=False), torch.nn.Linear(1, 1))
 
 

@@ -62,9 +62,9 @@ def test_variants_are_compared_over_the_same_env_steps() -> None:
     name = "dreamer_v3_circle"
     assert comparison.problems == [
         "gone left out: it has no metrics.csv",
-        f"{name}_default_seed1 ends at 500 env_steps, compared are 800 to 1,000: left out",
-        f"{name}_killed_seed0 ends at 900 env_steps, compared are 800 to 1,000: it counts as far as it goes",
-        f"{name}_young_seed0 ends at 300 env_steps, compared are 800 to 1,000: left out",
+        f"{name}_default_seed1 ends at 500 env_steps, but 800 to 1,000 are compared: left out",
+        f"{name}_killed_seed0 ends at 900 env_steps, but 800 to 1,000 are compared: used up to its end",
+        f"{name}_young_seed0 ends at 300 env_steps, but 800 to 1,000 are compared: left out",
     ]
 
 
@@ -111,15 +111,15 @@ def test_variants_are_compared_at_equal_cpu_time() -> None:
     assert default.values["gates"].tolist() == [9.0]  # of 0.8, 0.9 and 1 hours
     assert late.values["gates"].tolist() == [4.5]  # of 0.8 and 1 hours
     assert comparison.problems == [
-        f"{untimed.name} left out: it has no cpu_clock, which core_hours are read off",
-        "dreamer_v3 circle: compared up to 1.00 core_hours, where the first variant ends, of 2.00",
+        f"{untimed.name} left out: it has no cpu_clock, which axis=core_hours needs",
+        "dreamer_v3 circle: compared up to 1.00 core_hours, where the shortest variant ends, of 2.00",
     ]
     table = comparison_table(comparison)
     assert "| seeds | core_hours |" in table and "| 0.80–1.00 |" in table and "core_hours that every variant" in table
 
 
 def test_an_axis_that_is_not_there_is_refused() -> None:
-    with pytest.raises(ValueError, match="axis=minutes: there are env_steps, hours, core_hours"):
+    with pytest.raises(ValueError, match="axis=minutes: must be one of env_steps, hours, core_hours"):
         compare_variants(RUNS, axis="minutes")
 
 
@@ -183,7 +183,7 @@ def test_where_no_lap_was_flown_the_axis_is_not_negative(drawn):
 
 def test_no_study_is_left_out_in_silence():
     studies = [result(str(number), [flight("mass", 1.0, 4.0)]) for number in range(len(COLORS) + 1)]
-    with pytest.raises(ValueError, match="5 studies: no more than 4"):
+    with pytest.raises(ValueError, match="5 studies: at most 4"):
         plot_study(studies, "study.png")
 
 

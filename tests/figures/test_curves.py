@@ -114,9 +114,9 @@ def test_laps_of_fewer_than_half_of_the_seeds_are_not_drawn(tmp_path):
     np.testing.assert_allclose(at(curve, 2000), (5.0, 5 - np.sqrt(2), 5 + np.sqrt(2), 2))  # 2 of 3
     np.testing.assert_allclose(at(curve, 3000), (4.0, 2.0, 6.0, 3))
     np.testing.assert_allclose(at(curve, 4000), (4.0, 4 - np.sqrt(2), 4 + np.sqrt(2), 2), atol=0.02)
-    assert [problem for problem in result.problems if "left no value" in problem] == [
-        "Mean lap time (s, deterministic): where an evaluation left no value, mean of the seeds that have one, and "
-        "nothing where fewer than half do (1 of 1 curves)"
+    assert [problem for problem in result.problems if "has no value" in problem] == [
+        "Mean lap time (s, deterministic): where a seed has no value, the mean of the others; "
+        "a gap where fewer than half of the seeds have one (1 of 1 curves)"
     ]
 
 
@@ -175,7 +175,7 @@ def test_seeds_that_end_early_are_counted_and_named(tmp_path):
     result = curves_of(tmp_path)
     assert at(result.curves[0], 4000)[::3] == (2.0, 2)
     assert at(result.curves[0], 8000)[::3] == (1.0, 1)
-    assert result.problems == ["dreamer_v3_circle_seed1 ends at 5,000 of 10,000 env_steps: fewer seeds from there"]
+    assert result.problems == ["dreamer_v3_circle_seed1 ends at 5,000 of 10,000 env_steps: fewer seeds after that"]
 
 
 def test_a_raise_is_a_whole_increment(tmp_path):
@@ -244,8 +244,8 @@ def test_a_run_without_the_clock_is_left_out_by_name(tmp_path):
     write_run(tmp_path, "sac_circle_seed0", algorithm="sac")
     drawn = curves_of(tmp_path, axis="core_hours")
     assert [curve.key.algorithm for curve in drawn.curves] == ["ppo"]
-    assert "sac_circle_seed0 left out: it has no cpu_clock, which core_hours are read off" in drawn.problems
-    with pytest.raises(ValueError, match=r"axis=minutes: there are env_steps, hours, core_hours"):
+    assert "sac_circle_seed0 left out: it has no cpu_clock, which axis=core_hours needs" in drawn.problems
+    with pytest.raises(ValueError, match=r"axis=minutes: must be one of env_steps, hours, core_hours"):
         curves_of(tmp_path, axis="minutes")
 
 
@@ -348,7 +348,7 @@ def test_of_the_same_seed_twice_the_longer_run_counts(tmp_path):
     write_run(tmp_path / "b", "again", [5.0] * 2)
     result = curves_of(tmp_path)
     assert at(result.curves[0], 1500)[::3] == (1.0, 1)
-    assert result.problems == ["again left out: it has the settings and the seed of first, which got as far or further"]
+    assert result.problems == ["again left out: same settings and seed as first, which has at least as many env_steps"]
     ((first,), _), ((again,), _) = (read_runs([tmp_path / name]) for name in ("a/first", "b/again"))
     with pytest.raises(ValueError, match="same run twice.*seed: 0"):
         learning_curves([first, again])
@@ -418,7 +418,7 @@ def test_what_a_run_does_not_log_is_named(tmp_path):
     assert result.problems == ["no values of evaluation/lap_time_mean: all runs of dreamer_v3 circle"]
     with pytest.raises(ValueError, match="no run has values of lap_time"):
         curves_of(tmp_path, quantities=["lap_time"])
-    with pytest.raises(ValueError, match="quantities=speed: there are return"):
+    with pytest.raises(ValueError, match="quantities=speed: must be one of return"):
         curves_of(tmp_path, quantities=["speed"])
 
 

@@ -253,7 +253,7 @@ def test_the_live_page_says_the_same():
     cells = re.findall(r"<tr><th>([^<]*)</th><td[^>]*>([^<]*)</td><td[^>]*>([^<]*)</td></tr>", table)
     said = {name: values for name, *values in cells}
     assert said["lap"] == ["1/3", "2/3"] and said[""] == ["flying", "gate frame"]
-    assert said["value"] == [f"{10 * np.pi:.2f} return expected", "–"]
+    assert said["value"] == [f"{10 * np.pi:.2f} expected return", "–"]
     assert said["thrust"][1] == "–"  # after the last step there is no action
     style = dashboard_live.positions([30, 20], 0.5)
     assert "--now: 0.5000" in style and ".view-0 { --column: 5 !important; --row: 1 !important }" in style

@@ -150,7 +150,7 @@ def test_a_report_is_of_the_track_that_was_flown(tmp_path, unseen):
     kept, old = (json.loads((tmp_path / name / REPORT).read_text(encoding="utf-8")) for name in ("kept", "old"))
     assert kept["track"] == "circle" and len(kept["gates"]) == 8 and kept["problems"] == []
     assert old["track"] == "kidney" and len(old["gates"]) != 8
-    assert "the recording does not hold its track: kidney is taken as it is now" in old["problems"]
+    assert "the recording does not contain its track: today's kidney is used" in old["problems"]
 
 
 def test_a_track_that_is_damaged_in_the_recording_is_refused(tmp_path):
@@ -266,7 +266,7 @@ def test_the_flight_beside_a_simulated_one(tmp_path, flown, figures):
     assert [label.get_text() for label in latency.axes[0].get_yticklabels()][-1] == "end to end"
     assert tracking.axes[0].get_ylabel() == "thrust (m/s²)"
     assert tracking.axes[-1].get_xlabel().startswith("time since arming (s)")
-    assert "against: up to 4.0 m/s, 4.0 in the mean, 0 gates in 1.00 s" in lines
+    assert "against: up to 4.0 m/s, 4.0 on average, 0 gates in 1.00 s" in lines
     assert json.loads((flown / REPORT).read_text())["against"]["distance_m"] == pytest.approx(4.0)
     for name in (LATENCY, TRAJECTORY, TRACKING):
         with Image.open(flown / name) as image:
@@ -376,7 +376,7 @@ def test_a_flight_whose_loop_was_killed(tmp_path, flown, share, unseen):
     data = (flown / FILE).read_bytes()
     (tmp_path / FILE).write_bytes(data[: int(share * len(data))])
     lines = write_report(tmp_path)
-    assert "note: the file was not finished: the loop was killed, or it flies still" in lines
+    assert "note: the file is incomplete: the loop was killed, or is still running" in lines
 
 
 def test_damage_is_said(tmp_path, flown):

@@ -46,7 +46,7 @@ def test_learning_curves_have_a_panel_a_track_and_a_row_a_quantity(tmp_path, fig
     assert legend_texts(figures[0]) == ["DreamerV3 (2 seeds)", "SAC (2 seeds)"]
     assert (tmp_path / "figure_left_out.txt").read_text() == "ppo_circle_seed0 left out: it has no metrics.csv\n"
     (legend,) = [child for child in below.get_children() if hasattr(child, "get_texts")]
-    assert "standard deviation (n − 1) (none of one seed); running mean" in legend.get_title().get_text()
+    assert "standard deviation (n − 1) (none for one seed); running mean" in legend.get_title().get_text()
     colors = [line.get_color() for line in legend.get_lines()]
     assert len(set(colors)) == 2
     assert {line.get_color() for line in panels[0].lines} == set(colors)
@@ -111,7 +111,7 @@ def test_sixteen_variants_can_be_told_apart_and_no_more():
     assert len({(style["color"], str(style["linestyle"])) for style in styles.values()}) == 16
     few = list(line_styles(keys[:4]).values())  # differ in both
     assert len({style["color"] for style in few}) == len({str(style["linestyle"]) for style in few}) == 4
-    with pytest.raises(ValueError, match="17 variants of sac: a figure can tell 16 apart"):
+    with pytest.raises(ValueError, match="17 variants of sac: a figure can show at most 16"):
         line_styles(keys)
 
 

@@ -147,7 +147,7 @@ def test_an_agent_that_ships_is_flown_and_lacks_its_critic(tmp_path: Path) -> No
     pytest.importorskip("viser", reason="needs viser, of the extra dashboard")
     done = recipe("dashboard", "agent=kidney", cwd=tmp_path)
     assert done.returncode == 0, done.stderr
-    assert "finished           1 (100%)" in done.stdout and "no value, because no critic judged" in done.stdout
+    assert "finished           1 (100%)" in done.stdout and "no value, because the flight has no critic" in done.stdout
     text = (tmp_path / "runs" / "agent_kidney" / "dashboard.html").read_text(encoding="utf-8")
     assert 'data-of="speed"' in text and 'data-of="value"' not in text
     assert len(text) < 10e6

@@ -134,12 +134,12 @@ def test_without_opengl_no_flight_is_filmed_and_none_is_flown(
     fly = recipe_module("fly")
 
     def missing(*_: object, **__: object) -> None:
-        raise RendererUnavailableError("A drone is drawn from outside by OpenGL alone, and here is none.")
+        raise RendererUnavailableError("Only OpenGL can draw a drone from outside, and there is none here.")
 
     monkeypatch.setattr(fly, "ChaseView", missing)
     with pytest.raises(SystemExit):
         fly.fly(fly.FlyConfig(pilot="hover", view="chase", run_dir=str(tmp_path / "new")))
-    assert "by OpenGL alone, and here is none." in capsys.readouterr().err
+    assert "and there is none here." in capsys.readouterr().err
     assert not list(tmp_path.iterdir())
 
 

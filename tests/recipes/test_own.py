@@ -117,7 +117,7 @@ def test_training_and_evaluation_have_them_and_the_run_remembers(folder: Path) -
     [
         ("reward=my_own:wide", r"env\.reward=my_own:wide returned a tensor of shape \(2, 4\): must be \(2,\)"),
         ("reward=my_own:constnat", r"env\.reward=my_own:constnat: .* \(did you mean constant\?\)"),
-        ("vector=progress", r"env\.vector='progress': must be a function of your own"),
+        ("vector=progress", r"env\.vector='progress': must be a function"),
     ],
 )
 def test_bad_ones_are_refused_before_anything_is_built(folder: Path, own: str, message: str) -> None:

@@ -173,11 +173,11 @@ def test_half_a_file_that_the_user_named_is_refused(runs, recipe, figure, option
 @pytest.mark.parametrize(
     ("settings", "words"),
     [
-        ({"figure": "violins"}, "figure=violins: there are learning_curves"),
-        ({"quantities": ["speed"]}, "quantities=speed: there are return"),
+        ({"figure": "violins"}, "figure=violins: must be one of learning_curves"),
+        ({"quantities": ["speed"]}, "quantities=speed: must be one of return"),
         ({"runs": "nowhere"}, "runs=nowhere: there is no run directory"),
-        ({"flight": "worst"}, "flight=worst: there are last, best"),
-        ({"over": "height"}, "over=height: there are distance, time"),
+        ({"flight": "worst"}, "flight=worst: must be one of last, best"),
+        ({"over": "height"}, "over=height: must be one of distance, time"),
     ],
 )
 def test_bad_settings_are_refused(runs, recipe, settings, words):
@@ -199,7 +199,7 @@ def test_a_named_file_that_is_not_there_is_refused_for_any_figure(setting, figur
 def test_one_variant_is_not_compared(runs, recipe):
     config = recipe.PlotConfig(figure="comparison", runs=str(runs / "runs" / "dreamer_v3_circle_paper_seed0"))
     config.output = str(runs / "figures")
-    with pytest.raises(ValueError, match="figure=comparison: these runs are of one variant; runs= takes several"):
+    with pytest.raises(ValueError, match="figure=comparison: these runs have only one variant; runs= takes several"):
         recipe.draw(config)
 
 
@@ -217,7 +217,7 @@ def test_an_ordinary_folder_of_runs_is_drawn_as_curves_named_by_what_differs(run
         "DreamerV3 (1 seed)", "DreamerV3, env.preset=faithful (1 seed)"
     ]  # fmt: skip
     left_out = (runs / "figures" / "learning_curves_left_out.txt").read_text()
-    assert left_out.startswith("dreamer_v3_circle_20260101-120000 left out: it has the settings and the seed of ")
+    assert left_out.startswith("dreamer_v3_circle_20260101-120000 left out: same settings and seed as ")
 
 
 def test_all_figures_refuse_if_none_can_be_drawn(tmp_path, recipe):
@@ -265,6 +265,6 @@ def test_figures_of_an_experiment_do_not_depend_on_each_other(runs):
 def test_a_comparison_names_what_was_left_out(runs, recipe, figures):
     write_run(runs / "runs", "dreamer_v3_circle_seed0", returns=[1.0] * 40)
     recipe.draw(recipe.PlotConfig(figure="comparison", runs=str(runs / "runs"), output=str(runs / "figures")))
-    warning = "dreamer_v3_circle_paper_seed0 ends at 2,000 env_steps, compared are 32,000 to 40,000: left out"
+    warning = "dreamer_v3_circle_paper_seed0 ends at 2,000 env_steps, but 32,000 to 40,000 are compared: left out"
     assert f"- {warning}\n" in (runs / "figures" / "comparison.md").read_text()
     assert warning in (runs / "figures" / "comparison_left_out.txt").read_text()

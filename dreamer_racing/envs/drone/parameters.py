@@ -178,7 +178,7 @@ def load_preset(preset: str | QuadrotorParameters) -> QuadrotorParameters:
         return _read_drone(Path(preset))
     if not isinstance(preset, str) or preset not in PRESETS:
         there = ", ".join(sorted(PRESETS))
-        raise ValueError(f"preset={preset}: there is no such physics; there are {there}{suggestion(preset, PRESETS)}.")
+        raise ValueError(f"preset={preset}: must be one of {there}{suggestion(preset, PRESETS)}.")
     return PRESETS[preset]
 
 
@@ -187,7 +187,7 @@ def _read_drone(path: Path) -> QuadrotorParameters:
     base, changes = read_variation(path)
     if base not in PRESETS:
         there = ", ".join(sorted(PRESETS))
-        raise ValueError(f"{path}: preset: {quoted(base)} is none of {there}{suggestion(base, PRESETS)}.")
+        raise ValueError(f"{path}: preset: {quoted(base)} is not one of {there}{suggestion(base, PRESETS)}.")
     try:
         return apply_changes(PRESETS[base], changes)
     except (ValueError, TypeError) as error:
@@ -222,7 +222,7 @@ def at_control_rate(parameters: QuadrotorParameters, rate: float) -> QuadrotorPa
     """
     if not rate >= MIN_CONTROL_RATE:
         raise ValueError(
-            f"control_rate={rate} Hz: at least {MIN_CONTROL_RATE:g}, because a control step can pass one gate only."
+            f"control_rate={rate} Hz: must be at least {MIN_CONTROL_RATE:g}: a control step may pass only one gate."
         )
     steps = round(1.0 / (rate * parameters.physics_dt))
     if steps < 1 or abs(rate * steps * parameters.physics_dt - 1.0) > 1e-6:

@@ -63,10 +63,10 @@ def read_variation(path: Path) -> tuple[Any, dict[str, Any]]:
     try:
         content = yaml.safe_load(path.read_text(encoding="utf-8"))
     except (yaml.YAMLError, UnicodeDecodeError) as error:
-        raise ValueError(f"{path} is no YAML: {error}") from error
+        raise ValueError(f"{path} is not valid YAML: {error}") from error
     changes = content.get("parameters", {}) if isinstance(content, dict) else None
     if not isinstance(changes, dict):
-        raise ValueError(f"{path} is no drone: it must have preset:, a name, and parameters:, fields and their values.")
+        raise ValueError(f"{path} is not a drone file: it needs preset: (a name) and parameters: (fields and values).")
     return content.get("preset"), changes
 
 
@@ -84,7 +84,7 @@ def apply_changes(base: T, changes: Mapping[str, Any]) -> T:
         before = getattr(base, name)
         if isinstance(value, dict):
             if not dataclasses.is_dataclass(before):
-                raise ValueError(f"{name}={quoted(value)}: is no group of numbers.")
+                raise ValueError(f"{name}={quoted(value)}: {name} has no fields.")
             values[name] = apply_changes(before, value)
         else:
             values[name] = tuple(value) if isinstance(value, list) else value

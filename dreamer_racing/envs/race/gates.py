@@ -122,8 +122,8 @@ class GateSweeper:
         self._half_depth = track.shape.depth / 2
         if miss_radius and not miss_radius > self._half_outer:
             raise ValueError(
-                f"miss_radius={miss_radius}: a gate is missed beyond its frame, more than {self._half_outer:g} m from "
-                "the centre; 0 lets drones that miss fly on."
+                f"miss_radius={miss_radius}: must be more than {self._half_outer:g} m, which is half the width of the "
+                "frame, or 0: then drones fly on after a miss."
             )
         self._miss_radius = miss_radius
         self._gates = torch.arange(len(x), device=device).view(-1, 1, 1)
@@ -167,8 +167,8 @@ class GateSweeper:
             The passes and the first crash of each drone.
         """
         num_drones = target_gate.shape[0]
-        assert path.shape[1:] == (num_drones, 3), f"path is (P + 1, {num_drones}, 3), got {tuple(path.shape)}"
-        assert path.shape[0] >= 2, f"path has at least one segment, got {path.shape[0]} position"
+        assert path.shape[1:] == (num_drones, 3), f"path must be (P + 1, {num_drones}, 3), got {tuple(path.shape)}"
+        assert path.shape[0] >= 2, f"path needs at least 2 positions, got {path.shape[0]}"
         # (P + 1, N, 3) -> (3, P + 1, N)
         position = path.permute(2, 0, 1).contiguous()
         finite = position.isfinite().all(0)  # (P + 1, N)

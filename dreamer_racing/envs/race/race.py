@@ -120,7 +120,7 @@ class Race:
         miss_radius: float = 0.0,
     ):
         if not isinstance(weights, RewardWeights | None):
-            raise ValueError(f"weights={quoted(weights)}: must be RewardWeights, of dreamer_racing.envs.race.race.")
+            raise ValueError(f"weights={quoted(weights)}: must be RewardWeights, from dreamer_racing.envs.race.race.")
         self.track = track
         self.weights = weights or RewardWeights()
         if episode_steps is not None and episode_steps < 1:

@@ -140,7 +140,7 @@ class StartSampler:
     def on_line(self, share: float) -> None:
         _check_share("on_line", share)
         if share and self._line is None:
-            raise ValueError(f"on_line={share}: give a line to begin on, `plan_racing_line(track, parameters)`.")
+            raise ValueError(f"on_line={share}: needs a racing line, line=plan_racing_line(track, parameters).")
         self._on_line = share
 
     def _start(self, num: int) -> StartPose:
@@ -253,7 +253,7 @@ class StartSampler:
 def _check_share(name: str, share: float) -> None:
     """Refuse a share outside [0, 1]."""
     if not 0.0 <= share <= 1.0:
-        raise ValueError(f"{name}={share}: a share of episodes lies between 0 and 1.")
+        raise ValueError(f"{name}={share}: must be a share of episodes, from 0 to 1.")
 
 
 def _check_start_noise(start_noise: float, track: Track) -> None:
@@ -263,8 +263,8 @@ def _check_start_noise(start_noise: float, track: Track) -> None:
     most = ahead / math.hypot(*StartSampler.POSITION_NOISE[:2])
     if not 0.0 <= start_noise < most:
         raise ValueError(
-            f"start_noise={start_noise}: on track {track.name!r}, whose start is {ahead:.2f} m before the plane of the "
-            f"first gate, must be at least 0 and below {most:.2f} times the noise of training."
+            f"start_noise={start_noise}: must be at least 0 and below {most:.2f} on track {track.name!r}, "
+            f"where the start is {ahead:.2f} m before the plane of the first gate."
         )
 
 

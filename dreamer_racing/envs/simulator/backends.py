@@ -20,7 +20,7 @@ def check_device(device: torch.device | str) -> None:
         ValueError: the message says what is available.
     """
     if str(device).partition(":")[0] not in ("cpu", "cuda"):
-        raise ValueError(f"device={str(device)!r}: worlds live on cpu or cuda.")
+        raise ValueError(f"device={str(device)!r}: must be cpu or cuda.")
     device = torch.device(device)
     if device.type == "cpu":
         return
@@ -62,7 +62,7 @@ def make_simulator(
         return MujocoSimulator(track, parameters, num_envs, camera, renderer, num_threads, generator, looks)
     if renderer not in (None, "auto", "warp"):
         raise ValueError(
-            f"renderer={renderer!r} is of backend 'mujoco'. The backend on {str(device)!r} is 'mujoco_warp', which "
-            "draws with a renderer of its own: use renderer='auto' or 'warp'."
+            f"renderer={renderer!r} is for backend 'mujoco'. The backend on {str(device)!r} is 'mujoco_warp', which "
+            "has its own renderer: use renderer='auto' or 'warp'."
         )
     return WarpSimulator(track, parameters, num_envs, camera, renderer is not None, device, generator, looks)

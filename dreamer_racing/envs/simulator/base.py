@@ -134,7 +134,7 @@ class Simulator(ABC):
         looks = state_dict.get("looks")
         if (looks is None) != (self.looks is None):
             saved, present = ("nominal" if missing else "randomised" for missing in (looks is None, self.looks is None))
-            raise ValueError(f"The saved worlds have {saved} looks, these {present}: resume with looks={saved}.")
+            raise ValueError(f"looks={present}: the saved worlds have looks={saved}, so resume with that.")
         if self.looks is not None and looks is not None:
             self.looks.load_state_dict(looks)
 
@@ -146,4 +146,4 @@ class Simulator(ABC):
 def no_images(closed: bool) -> RuntimeError:
     """Return the error for rendering with a simulator that is closed or has no renderer."""
     reason = "is closed" if closed else "was made with renderer=None"
-    return RuntimeError(f"This simulator has no images to give: it {reason}.")
+    return RuntimeError(f"This simulator cannot render images: it {reason}.")

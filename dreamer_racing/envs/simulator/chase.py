@@ -133,5 +133,5 @@ def _open(model: mujoco.MjModel, camera: Camera) -> OpenGLScene:
         except RendererUnavailableError as error:
             reasons.append(str(error))
     raise RendererUnavailableError(
-        f"A drone is drawn from outside by OpenGL alone, and here is none. {' '.join(reasons)}"
+        f"Only OpenGL can draw a drone from outside, and there is none here. {' '.join(reasons)}"
     )

@@ -34,9 +34,9 @@ class LooksRandomisation:
         check_numbers({}, {f"LooksRandomisation: {name}": width for name, width in widths.items()})
         for name, width in widths.items():
             if width not in NOT_NEGATIVE:
-                raise ValueError(f"LooksRandomisation: {name}={width} must not be negative, and finite.")
+                raise ValueError(f"LooksRandomisation: {name}={width} must be finite and not negative.")
         if self.brightness >= 1.0 or self.color >= 1.0:
-            raise ValueError("LooksRandomisation: brightness and color are relative half-widths, below 1.")
+            raise ValueError("LooksRandomisation: brightness and color are relative half-widths and must be below 1.")
 
 
 @dataclass(frozen=True)
@@ -84,8 +84,8 @@ class LooksSampler:
         widest = min(camera.field_of_view, 180.0 - camera.field_of_view)
         if not randomisation.field_of_view < widest:
             raise ValueError(
-                f"LooksRandomisation: field_of_view={randomisation.field_of_view}: around the camera's "
-                f"{camera.field_of_view:g} degrees it must be below {widest:g}, to stay between 0 and 180."
+                f"LooksRandomisation: field_of_view={randomisation.field_of_view}: must be below {widest:g}, so that "
+                f"{camera.field_of_view:g} degrees of the camera ± this value stay between 0 and 180."
             )
         self._randomisation = randomisation
         self._generator = generator

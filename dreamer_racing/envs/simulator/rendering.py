@@ -122,7 +122,7 @@ class RenderThread(Thread):
             RuntimeError: the thread has ended, as all do when the interpreter exits.
         """
         if not self.is_alive():
-            raise RuntimeError("Nothing can be drawn any more: the interpreter exits.")
+            raise RuntimeError("Rendering has ended, because the interpreter exits.")
         future: Future[T] = Future()
         self._tasks.put(Task(future, function, arguments))
         return future

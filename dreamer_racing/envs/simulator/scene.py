@@ -92,7 +92,7 @@ def load_camera(camera: Camera | None, rate: float | None = None, from_pixels: b
     if rate is None:
         return camera
     if not from_pixels:
-        raise ValueError(f"camera_rate={quoted(rate)}: is of images, and from_pixels=False shows none: leave it out.")
+        raise ValueError(f"camera_rate={quoted(rate)}: needs images, but from_pixels=False: leave it out.")
     check_setting("camera_rate", rate, POSITIVE)
     return replace(camera, rate=rate)
 
@@ -112,14 +112,14 @@ def frame_interval(camera: Camera, control_rate: float) -> int:
     steps = control_rate / camera.rate
     if steps < 1 - 1e-6:
         raise ValueError(
-            f"camera_rate={camera.rate:g} Hz: at most control_rate={control_rate:g}, for an image is looked at once in "
-            "a control step."
+            f"camera_rate={camera.rate:g} Hz: must be at most control_rate={control_rate:g}, because a control step "
+            "uses only one image."
         )
     if abs(steps - round(steps)) > 1e-6 * steps:
         slower, faster = control_rate / math.ceil(steps), control_rate / math.floor(steps)
         raise ValueError(
             f"camera_rate={camera.rate:g} Hz: must be control_rate={control_rate:g} divided by a whole number, so that "
-            f"every frame is shown for as many control steps: {slower:g} or {faster:g} are the nearest."
+            f"every frame lasts for the same number of control steps: {slower:g} or {faster:g} are the nearest."
         )
     return round(steps)
 

@@ -126,7 +126,7 @@ def _find(name_or_path: str | Path) -> Path:
     try:
         state = "" if path.is_file() else "is not a file" if path.exists() else "does not exist"
     except OSError as error:
-        state = f"cannot be looked at ({error.strerror})"
+        state = f"cannot be accessed ({error.strerror})"
     if state:
         raise TrackError(
             f"the track file {quoted(str(path))} {state} (working folder: {Path.cwd()}). Give the path of a .yaml file "
@@ -144,7 +144,7 @@ class _PlainLoader(yaml.SafeLoader):
     def compose_node(self, parent: yaml.Node | None, index: int) -> yaml.Node | None:
         if self.check_event(yaml.AliasEvent):
             event = self.peek_event()
-            raise yaml.composer.ComposerError(None, None, "aliases (*name) are not taken", event.start_mark)
+            raise yaml.composer.ComposerError(None, None, "aliases (*name) are not allowed", event.start_mark)
         return super().compose_node(parent, index)
 
     def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Hashable, Any]:

@@ -128,7 +128,7 @@ def _check_kinds(track: Track, source: str) -> None:
     for name, gate in _named_gates(track):
         kind = "race" if name.startswith("gates") else "decoy"
         if gate.kind != kind:
-            raise refusal(source, f"{name}.kind", gate.kind, f"{kind!r}: race gates stand in gates, decoys in decoys")
+            raise refusal(source, f"{name}.kind", gate.kind, f"{kind!r}: race gates belong in gates, decoys in decoys")
 
 
 def _check_shape(shape: GateShape, source: str) -> None:
@@ -216,7 +216,7 @@ def _check_legs(track: Track, source: str) -> None:
         places.append(places[1])
     for (name, position), (next_name, next_position) in pairwise(places):
         if (leg := math.dist(position, next_position)) > FARTHEST_LEG:
-            allowed = f"at most {FARTHEST_LEG:.0f} m from {name}, as far as a flight can be: it is {leg:.0f} m"
+            allowed = f"at most {FARTHEST_LEG:.0f} m from {name}, the range of one flight: it is {leg:.0f} m"
             raise refusal(source, next_name, next_position, allowed)
 
 

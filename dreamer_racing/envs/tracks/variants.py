@@ -45,7 +45,7 @@ def with_decoys(track: str | Path | Track, decoys: str | None) -> Track:
     if decoys == "none":
         return _without_decoys(loaded)
     if decoys not in DECOYS:
-        raise TrackError(f"decoys={decoys}: there are {', '.join(DECOYS)}, and none.")
+        raise TrackError(f"decoys={decoys}: must be {', '.join(DECOYS)} or none.")
     places = DECOYS[decoys]
     decorated = {plain: load_track(name) for plain, name in places.items()}
     for plain, target in decorated.items():
@@ -109,7 +109,7 @@ def displace_gates(track: Track, shift: float, turn_degrees: float, seed: int) -
         return displaced
     raise TrackError(
         f"track {track.name!r}: none of {ATTEMPTS} displacements by up to {shift} m and {turn_degrees}° can be flown. "
-        "Smaller ones would do, or gates that stand farther from each other and from the bounding box."
+        "Use smaller ones, or place the gates farther from each other and from the bounding box."
     )
 
 

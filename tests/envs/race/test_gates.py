@@ -283,7 +283,7 @@ def test_wrong_shapes_are_refused():
     sweeper = GateSweeper(PLAIN)
     with pytest.raises(AssertionError, match=r"\(P \+ 1, 5, 3\), got \(11, 4, 3\)"):
         sweeper(torch.zeros(11, 4, 3), torch.zeros(5, dtype=torch.int64))
-    with pytest.raises(AssertionError, match="at least one segment"):
+    with pytest.raises(AssertionError, match="at least 2 positions"):
         sweeper(torch.zeros(1, 5, 3), torch.zeros(5, dtype=torch.int64))
 
 

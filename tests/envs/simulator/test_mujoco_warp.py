@@ -204,7 +204,7 @@ def test_absent_cuda_is_named(make: type, device: str) -> None:
 
 def test_other_devices_are_refused() -> None:
     for device in ("meta", "gpu"):
-        with pytest.raises(ValueError, match=f"device='{device}': worlds live on cpu or cuda"):
+        with pytest.raises(ValueError, match=f"device='{device}': must be cpu or cuda"):
             DroneRacingEnv("circle", device=device)
 
 

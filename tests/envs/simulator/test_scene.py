@@ -309,7 +309,7 @@ def test_noise_is_of_the_width_asked_for_and_new_in_every_image() -> None:
 def test_a_state_with_other_looks_is_refused(saved: str | None, present: str | None) -> None:
     one, other = worlds(saved), worlds(present)
     name = saved or "nominal"
-    with pytest.raises(ValueError, match=f"The saved worlds have {name} looks.*resume with looks={name}"):
+    with pytest.raises(ValueError, match=f"the saved worlds have looks={name}, so resume"):
         other.load_state_dict(one.state_dict())
     one.close()
     other.close()
@@ -320,11 +320,11 @@ def test_bad_looks_are_refused() -> None:
         load_looks("pretty")
     with pytest.raises(ValueError, match="or a LooksRandomisation"):
         load_looks({"noise": 0.1})
-    with pytest.raises(ValueError, match="noise=-1.0 must not be negative"):
+    with pytest.raises(ValueError, match="noise=-1.0 must be finite and not negative"):
         LooksRandomisation(noise=-1.0)
     with pytest.raises(ValueError, match="below 1"):
         LooksRandomisation(brightness=1.0)
-    with pytest.raises(ValueError, match="gate_color=inf must not be negative, and finite"):
+    with pytest.raises(ValueError, match="gate_color=inf must be finite and not negative"):
         LooksRandomisation(gate_color=math.inf)
     with pytest.raises(ValueError, match="camera_tilt='3': must be a number"):
         LooksRandomisation(camera_tilt="3")
@@ -332,5 +332,5 @@ def test_bad_looks_are_refused() -> None:
 
 @pytest.mark.parametrize(("lens", "width", "most"), [(90.0, 95.0, 90), (90.0, 90.0, 90), (120.0, 60.0, 60)])
 def test_lenses_vary_no_further_than_there_are_any(lens: float, width: float, most: int) -> None:
-    with pytest.raises(ValueError, match=f"field_of_view={width}: around the camera's {lens:g} .* below {most}"):
+    with pytest.raises(ValueError, match=f"field_of_view={width}: must be below {most}, so that {lens:g} degrees"):
         worlds(LooksRandomisation(field_of_view=width), "warp", camera=Camera(field_of_view=lens))

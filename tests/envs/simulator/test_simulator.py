@@ -398,7 +398,7 @@ def test_closing_twice_is_safe() -> None:
     made = simulator(2, "auto")
     made.close()
     made.close()
-    with pytest.raises(RuntimeError, match="to give: it is closed.$"):
+    with pytest.raises(RuntimeError, match="cannot render images: it is closed.$"):
         made.render()
 
 

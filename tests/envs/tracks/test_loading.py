@@ -263,7 +263,7 @@ def test_a_way_that_no_flight_is_long_enough_for(write, field, gate, start, laps
     gates = "".join(f"  - {{position: {position}, yaw_degrees: 0}}\n" for position in far)
     box = "bounds: {low: [-1000, -1000, 0], high: [1000, 1000, 6]}"
     text = f"gates:\n{gates}start: {{position: [{start}, 0, 1.35]}}\nlaps: {laps}\n{box}\n"
-    with pytest.raises(TrackError, match=r"at most 540 m from .*, as far as a flight can be: it is \d+ m") as refusal:
+    with pytest.raises(TrackError, match=r"at most 540 m from .*, the range of one flight: it is \d+ m") as refusal:
         load_track(write(text))
     assert field in str(refusal.value)
     near = text.replace(str(gate), "200").replace(f"[{start},", "[-3,")
