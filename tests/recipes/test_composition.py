@@ -338,7 +338,7 @@ def test_what_the_chosen_losses_do_not_have_moves_only_if_it_is_asked_for():
 def test_nothing_goes_by_gates_where_there_are_none():
     overrides = ["env=dmc", "model=debug", "device=cpu", "schedule.discount.to=0.9", "schedule.discount.by=passes"]
     config = OmegaConf.to_object(recipe_module("dreamer_v3").resolve(compose("dreamer_v3", *overrides)))
-    with pytest.raises(ValueError, match=r"schedule.discount.by=passes goes by gates, and env.suite=dmc has none"):
+    with pytest.raises(ValueError, match=r"schedule.discount.by=passes depends on gates, and env.suite=dmc has none"):
         config.check()
 
 
