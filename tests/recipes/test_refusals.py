@@ -84,10 +84,7 @@ REFUSED = [
     (["schedule.discount.begin=0.6", "schedule.discount.end=0.5"], ["schedule.discount: begin=0.6 and end=0.5"]),
     (["schedule.learning_rates.to=0"], ["schedule.learning_rates.to=0.0: must be above 0"]),
     (["schedule.start_on_line.to=0.3"], ["schedule.start_on_line starts from env.start_on_line=0"]),
-    (
-        ["loss.actor=asymmetric_ppo"],
-        ["'asymmetric_ppo' was removed: use recipes/latent_ppo.py loss.critic=state."],
-    ),
+    (["loss.actor=asymmetric_ppo"], ["'asymmetric_ppo' was removed: use recipes/latent_ppo.py loss.critic=state."]),
     (["tuned=images", "env.from_pixels=false"], ["tuned=images is for agents that see images", "leave one out"]),
     (["env=dmc", "loss.critic=state"], ["loss.critic=state: read", "loss.critic=latent"]),
     (["schedule.world_model_rate.to=0"], ["schedule.world_model_rate.to=0.0: must be above 0"]),
@@ -99,7 +96,7 @@ REFUSED = [
         ["loss.ppo.kl_target=0.01", "schedule.kl_target.to=0.03"],
         ["loss.ppo.kl_stop=0.03 must be at least 1.5 times schedule.kl_target.to=0.03"],
     ),
-    (["schedule.kl_target.to=0.01"], ["schedule.kl_target.to=0.01 begins at loss.ppo.kl_target=null"]),
+    (["schedule.kl_target.to=0.01"], ["schedule.kl_target.to=0.01 starts from loss.ppo.kl_target=null"]),
     (["loss.ppo.kl_target=0.01", "schedule.kl_target.to=0"], ["schedule.kl_target.to=0.0: must be above 0"]),
     (["model.average_rate=5"], ["model.average_rate=5.0: must be above 0 and at most 1"]),
     (["loss.min_std=0.5", "loss.max_std=0.5"], ["loss.min_std=0.5 must be below loss.max_std=0.5"]),
@@ -170,8 +167,8 @@ def test_what_would_be_ignored_is_refused(overrides: list[str], words: str) -> N
         (["env.from_pixels=false", "loss.image_share=0.5"], "is for loss=reconstruction or informed, from images"),
         (["loss=privileged", "loss.barlow_scale=3"], "loss.barlow_scale=3.* is for loss=decoder_free"),
         (["loss.critic=state", "model.imagination_starts=8"], "imagination_starts=8 is for recipes/dreamer_v3.py, whi"),
-        (["loss.drift_scale=1", "replay.context=true"], "drift_scale=1.* is for .*, as they are, model.sampled=false"),
-        (["loss.drift_scale=1", "model.sampled=false"], "drift_scale=1.* is for records that keep latents, replay.con"),
+        (["loss.drift_scale=1", "replay.context=true"], "drift_scale=1.* is for stored latents .*model.sampled=false"),
+        (["loss.drift_scale=1", "model.sampled=false"], "drift_scale=1.* is for stored latents .replay.context=true"),
         (["replay.recent_records=9"], "replay.recent_records=9 is for replay.recent_share above 0"),
         (["replay.storage=memmap", "replay.device=cpu"], "replay.device=cpu is for replay.storage=tensor"),
         (["schedule.wait_every=9"], "wait_every=9 is for schedule.wait_for_model, which is not chosen"),
@@ -265,8 +262,8 @@ def test_an_unknown_protocol_is_refused() -> None:
 
 
 @pytest.mark.parametrize("name", ["circle", str(ROOT / "agents" / "circle")])
-def test_an_agent_is_begun_with_not_resumed(name: str) -> None:
-    words = f"resume={name} is an agent, which no run goes on from: begin one with init_from={name}."
+def test_an_agent_cannot_be_resumed(name: str) -> None:
+    words = f"resume={name} is an agent, not a run to resume: start one with init_from={name}."
     with pytest.raises(ValueError, match=re.escape(words)):
         recipe_module("composing.launching").resumed_config("dreamer_v3", name, [])
 
