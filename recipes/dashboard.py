@@ -123,8 +123,8 @@ def locate(setting_name: str, place: str) -> Path | str:
     flights = stored_flights(path)
     if not flights:
         raise FileNotFoundError(
-            f"{setting_name}={place} holds no flight: no *{NUMBERS} in it or in its evaluations/, which every "
-            f"evaluation leaves. agent={place} flies its newest checkpoint now."
+            f"{setting_name}={place} holds no flight: no *{NUMBERS} in it or in its evaluations/, where every "
+            f"evaluation writes one. agent={place} flies its newest checkpoint now."
         )
     return flights[-1]
 
@@ -162,7 +162,7 @@ def how_it_trained(sources: list[Source]) -> str:
     # Relative to the working directory if possible, because pages are shown to others.
     logged = {Path(from_here(source.folder)): None for source in sources if (source.folder / "tensorboard").is_dir()}
     if not logged:
-        return "Training curves: these flights lie in no run directory with TensorBoard files."
+        return "Training curves: none, because these flights are in no run directory with TensorBoard files."
     if len(logged) == 1:
         return f"Training curves: `tensorboard --logdir {shlex.quote(str(*logged))}`"
     runs = ",".join(f"{folder.name}:{folder}" for folder in logged)

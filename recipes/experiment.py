@@ -157,8 +157,8 @@ def refuse_other_settings(run_dir: Path, overrides: list[str]) -> None:
             f"{name}: {saved.get(name, 'not given')} and {wanted.get(name, 'not given')}" for name in differing
         )
         raise ValueError(
-            f"{run_dir} holds a run with other settings, there and asked for: {values}. Choose another name=, or take "
-            "that run away."
+            f"{run_dir} holds a run with other settings (there, then requested): {values}. Choose another name=, or "
+            "move that run away."
         )
 
 

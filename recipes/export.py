@@ -110,18 +110,18 @@ def export(config: ExportConfig) -> None:
         trained.track_description = serialize_track_file(trained.track)
     if trained.env.vector is not None:
         raise ValueError(
-            f"{checkpoint} was trained with env.vector={trained.env.vector}, which computes from the simulator's state "
-            "what no drone in flight is told: export an agent that sees images, or images and env.imu."
+            f"{checkpoint} was trained with env.vector={trained.env.vector}, which reads the simulator's state, "
+            "unknown to a real drone: export an agent that sees images, or images and env.imu."
         )
     check_agent(config, checkpoint)
     output = check_output(config.output or Path(config.agent or results_of(checkpoint) / "export") / ACTOR)
     if not config.agent and is_agent(output.parent):
-        raise ValueError(f"output={config.output}: {output.parent} holds an agent, which stays as it is: name another.")
+        raise ValueError(f"output={config.output}: {output.parent} holds an agent, which is kept: choose another.")
     print(f"checkpoint: {checkpoint}")
     step, contract, flight = prepare(config, trained, checkpoint)
     about = describe(config, trained, checkpoint, step, contract) if config.agent else None
     deviation = export_actor(step, contract, flight, output, config.seed, about is not None, config.parts)
-    print(f"replayed: {len(flight.actions)} steps, {flight.episodes} episodes, latents alike")
+    print(f"replayed: {len(flight.actions)} steps, {flight.episodes} episodes, latents equal")
     for name, value in deviation.items():
         print(f"largest deviation of an action, {name} from torch: {value:.1e}")
     names = [*(file["name"] for file in read_contract(output.parent / CONTRACT)["files"].values()), CONTRACT]
@@ -201,7 +201,7 @@ def describe(
     history = history_of(checkpoint, source["env_steps"])
     commit = config.commit or (history[-1]["commit"] if history else None)
     if commit is None:
-        print("commit of the training: not noted, for neither the run nor commit= says it")
+        print("commit of the training: unknown, because neither the run nor commit= gives it")
     trains = f"python recipes/{trained.algorithm}.py {shlex.join(history[-1]['overrides'])}" if history else None
     training = {"command": trains, "commit": commit, "seed": trained.seed}
     if len(history) > 1:  # resumed, perhaps with other settings
@@ -248,14 +248,14 @@ def read_evaluation(
     path = Path(config.evaluation or newest_evaluation(results_of(checkpoint), weights_sha256, track_sha256))
     how = f"Make it with: {command('evaluate')} checkpoint={shlex.quote(config.checkpoint)} episodes=100"
     if not path.is_file():
-        raise FileNotFoundError(f"There is no evaluation {path}: an agent ships with its numbers. {how}")
+        raise FileNotFoundError(f"There is no evaluation {path}: an agent ships with its results. {how}")
     try:
         written = json.loads(path.read_text(encoding="utf-8"))
         made = written["provenance"]
     except (ValueError, KeyError, TypeError) as error:
-        raise ValueError(f"{path} is no evaluation of recipes/evaluate.py ({error!r}). {how}") from error
+        raise ValueError(f"{path} is not an evaluation by recipes/evaluate.py ({error!r}). {how}") from error
     if made.get("weights_sha256") != weights_sha256:
-        raise ValueError(f"{path} is the evaluation of other weights than those of {checkpoint}. {how}")
+        raise ValueError(f"{path} is an evaluation of other weights than those of {checkpoint}. {how}")
     if made.get("track_sha256") is None:
         raise ValueError(f"{path} does not say which track it was flown on. {how}")
     if made["track_sha256"] != track_sha256:
@@ -283,7 +283,7 @@ def write_agent(folder: Path, trained: WorldModelRunConfig, about: dict[str, Any
     """Write the configuration, and last agent.json, which makes the folder an agent."""
     (folder / AGENT).unlink(missing_ok=True)
     if trained.env.reward is not None:
-        print(f"reward: the agent ships without env.reward={trained.env.reward}; wherever it flies, Eq. 1 is paid")
+        print(f"reward: the agent ships without env.reward={trained.env.reward}; its evaluations use Eq. 1")
     env, track = (
         replace(trained.env, device="cpu", reward=None),
         Path(trained.track).name,
@@ -303,7 +303,7 @@ def measure(step: ActorStep, flight: RecordedFlight, output: Path, parts: bool) 
     if parts:
         actor = OnnxActor(output)
         latency = measure_latency(partial(actor.step, **imu), flight.observations, actor.prepare)
-        print(f"of it from image to action: {latency}")
+        print(f"of this, from image to action: {latency}")
 
 
 if __name__ == "__main__":

@@ -246,7 +246,7 @@ def agents_flight(config: FlyConfig) -> PlannedFlight:
             given, trained = getattr(config, name), getattr(restored.trained.env, name)
             if given is not None and given != trained:
                 raise ValueError(
-                    f"{name}={given}: {config.agent} was trained with {name}={trained}, and flies with nothing else."
+                    f"{name}={given}: {config.agent} was trained with {name}={trained}, which cannot change."
                 )
         worlds = shared_env_arguments(restored.trained) | {"seed": config.seed}
         track = load_track(worlds["track"])

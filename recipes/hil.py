@@ -150,13 +150,13 @@ def prepare(config: HilConfig, opened: ExitStack) -> Prepared:
         watchers.append(view.show)
     print(f"{config.actor} on {track.name} at {flyer.rate:g} Hz, link={config.link}, arm={config.arm}: {folder}")
     print(f"poses: {config.pose}, stamped by {config.stamping.value}")
-    lifted = f"straight up, with up to {config.lift:g} of its weight until it rises, then by"
+    lifted = f"straight up, with a thrust of up to {config.lift:g} times its weight until it rises, then by"
     print(f"take-off: {lifted if config.lift else 'by'} {config.actor}")
     if preset := contract["source"].get("preset"):
-        print(f"its drone: {config.actor} flies that of preset={preset}: a plant needs preset={preset}, too")
+        print(f"drone: {config.actor} is made for preset={preset}: a simulated drone needs that, too")
     if config.pose == "udp":
         plant = f"{command('plant')} track={config.track or track.name}{f' preset={preset}' if preset else ''}"
-        print(f"it waits for poses: if no vehicle sends any, start one in another terminal: {plant}")
+        print(f"waiting for poses: if no vehicle sends any, start a simulated one in another terminal: {plant}")
     loop = FlightLoop(chain, poses, operator, link, flyer.rate, recorder, watchers)
     return Prepared(folder, track, chain, poses, link, loop)
 
@@ -205,7 +205,7 @@ def say(summary: dict[str, Any]) -> None:
     print(f"ticks: {summary['loop']['ticks']}, overruns: {summary['loop']['overruns']}")
     rejected, out_of_order = summary["poses"]["rejected"], summary["poses"]["out_of_order"]
     if rejected or out_of_order:
-        print(f"poses left out: {rejected} messages that were none, {out_of_order} out of order")
+        print(f"poses ignored: {rejected} invalid messages, {out_of_order} out of order")
     if summary["battery"] is not None:
         print(in_words(summary["battery"]))
 
@@ -213,11 +213,11 @@ def say(summary: dict[str, Any]) -> None:
 def in_words(battery: dict[str, Any]) -> str:
     """Return, in words, the voltage that the thrust map used, and where it came from."""
     if not battery["readings"]:
-        return f"battery: nothing usable was heard of it; thrust was reckoned by voltage={battery['voltage_set']:g}"
+        return f"battery: no usable reading; thrust was computed with voltage={battery['voltage_set']:g}"
     age = battery["last_reading_age_s"]
     old = f", the last one {age:.1f} s before the end: STALE" if age > STALE else ""
-    left_out = f", {battery['implausible']} implausible ones left out" if battery["implausible"] else ""
-    return f"battery: {battery['voltage']:.2f} V at the end, by {battery['readings']} readings{left_out}{old}"
+    left_out = f", {battery['implausible']} implausible ones ignored" if battery["implausible"] else ""
+    return f"battery: {battery['voltage']:.2f} V at the end, from {battery['readings']} readings{left_out}{old}"
 
 
 def replay(config: HilConfig) -> int:
@@ -230,11 +230,11 @@ def replay(config: HilConfig) -> int:
     except (KeyError, TypeError, OmegaConfBaseException) as error:
         raise ValueError(
             f"replay={config.replay} was flown with settings that this version does not know "
-            f"({str(error).partition(chr(10))[0]}): play it back by the version that its recording names."
+            f"({str(error).partition(chr(10))[0]}): replay it with the version named in its recording."
         ) from error
     settings = cast(HilConfig, flown)
     if not flight.holds_track:
-        print("note: the recording does not hold its track: it is taken as it is now")
+        print("note: the recording does not contain its track; the current version of the track is used")
     track = flight.track()
     flyer, _ = make_flyer(settings, track)
     settings.renderer = config.renderer
@@ -251,7 +251,7 @@ def play(flight: Flight, chain: FlightChain) -> int:
             name = differing[0]
             print(f"tick {index}: {name} was {tick['out'][name]}, and is {again.get(name)} now", file=sys.stderr)
             return 1
-    print(f"replayed: {len(flight.ticks)} ticks, every one as it was written{'' if flight.whole else ' (cut off)'}")
+    print(f"replayed: {len(flight.ticks)} ticks, all equal to the recording{'' if flight.whole else ' (cut off)'}")
     return 0
 
 

@@ -66,7 +66,7 @@ def identify(config: IdentificationConfig) -> None:
         "not_told": list(found.unknown),
     }
     if not all(math.isfinite(error) for error in found.errors.values()):
-        raise ValueError("The fit diverged: begin with a preset= that is nearer.")
+        raise ValueError("The fit diverged: start from a preset= closer to the drone.")
     save_drone(Path(config.output), found.parameters, about)
     say(config, found)
 
@@ -77,14 +77,14 @@ def say(config: IdentificationConfig, found: "Fit") -> None:
     for name, value in found.values.items():
         scale = 1e3 if name == "delay" else 1.0
         width = scale * found.deviations[name] * (1.0 if name == "delay" else value)
-        untold = "   little is told of it" if name in found.unknown else ""
-        print(f"{name:<10}{scale * value:>10.3f}{width:>8.3f}{untold}")
+        remark = "   poorly determined" if name in found.unknown else ""
+        print(f"{name:<10}{scale * value:>10.3f}{width:>8.3f}{remark}")
     for axis, error in found.errors.items():
-        print(f"{axis}: body rates follow within {error:.1%} of what was asked ({found.before[axis]:.1%} before)")
+        print(f"{axis}: RMS error of body rates {error:.1%} of the commanded rates ({found.before[axis]:.1%} before)")
     if found.thrust is None:
         print("thrust: no force was measured")
     else:
-        print(f"thrust: {found.thrust:.3f} of what was believed: multiply full_thrust= of recipes/hil.py by it")
+        print(f"thrust: {found.thrust:.3f} of the assumed thrust: multiply full_thrust= of recipes/hil.py by it")
     print(f"written to {config.output}: env=betaflight env.preset={config.output}")
 
 

@@ -154,7 +154,7 @@ def to_markdown(
     title: str, looked: dict[str, SightResults], corrupted: dict[float, list[Result]], provenance: dict[str, Any]
 ) -> str:
     """Return the tables as a Markdown page."""
-    parts = [report_heading(title, provenance), "## What the camera is turned to\n", START_TEXT[START_NOISE]]
+    parts = [report_heading(title, provenance), "## What the camera points at\n", START_TEXT[START_NOISE]]
     sights = {name: kind.sights for name, kind in looked.items()}
     parts += [sight_table(sights), "Share of time in view, gate by gate:\n", gate_table(sights)]
     parts.append("![perception](perception.png)\n")

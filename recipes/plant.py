@@ -38,7 +38,9 @@ class PlantConfig(ProcessOptions, Delivery, Mismatch):
     def check(self) -> None:
         """Refuse a command delay if a firmware flies, and an actor without a firmware to set up for it."""
         if self.delay is not None and (name := firmware_option(self)):
-            raise ValueError(f"delay={self.delay} is of commands, and {name}={getattr(self, name)}: leave one out.")
+            raise ValueError(
+                f"delay={self.delay} is for commands, which {name}={getattr(self, name)} replaces: leave one out."
+            )
         if self.actor != PILOT and self.firmware is None:
             raise ValueError(f"actor={self.actor} is for firmware=, which is set up for it: add that, or leave it out.")
 

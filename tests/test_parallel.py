@@ -345,10 +345,10 @@ def test_a_checkpoint_of_two_processes_is_restored_by_one_two_or_four(tmp_path: 
     for file in [path for path in sorted((saved / "process-1").rglob("*")) if path.is_file()]:
         content = file.read_bytes()
         file.write_bytes(content[:-1] + bytes([content[-1] ^ 1]))
-        with pytest.raises(RunCheckpointError, match="process-1/.* is not what was saved"):
+        with pytest.raises(RunCheckpointError, match="process-1/.* does not match its checksum"):
             newest_sound(saved)
         file.write_bytes(content)
     assert newest_sound(saved, ["counters"]) == saved
     (saved / "process-1" / "manifest.json").unlink()
-    with pytest.raises(RunCheckpointError, match=r"process-1/manifest\.json is not what was saved"):
+    with pytest.raises(RunCheckpointError, match=r"process-1/manifest\.json does not match its checksum"):
         newest_sound(saved, ["counters"])

@@ -58,7 +58,7 @@ class WorkersConfig:
         """
         if self.gpus > 1 and self.gpus % 1:
             raise ValueError(
-                f"workers.gpus={self.gpus:g}: Ray gives a worker a part of one GPU or whole ones, e.g. "
+                f"workers.gpus={self.gpus:g}: a worker can have a fraction of one GPU or a whole number of GPUs, e.g. "
                 f"workers.gpus={math.floor(self.gpus)}."
             )
 
@@ -88,9 +88,9 @@ def join(address: str) -> bool:
         ray.init(address=address, include_dashboard=False, logging_level=logging.WARNING)
     except (OSError, RuntimeError, ValueError, ray.exceptions.RayError) as error:
         raise ValueError(
-            f"workers.address={address}: no Ray cluster could be joined there ({in_a_line(error)}). Start one of the "
-            "same versions of Python and Ray, ray start --head, and give its address, or have one started on this "
-            "machine by workers.address=local."
+            f"workers.address={address}: cannot connect to a Ray cluster there ({in_a_line(error)}). Start one with "
+            "the same versions of Python and Ray (ray start --head) and give its address, or start one on this machine "
+            "with workers.address=local."
         ) from error
     return True
 
@@ -141,8 +141,8 @@ def check_resources(
     if (room := sum(places(share, node) for node in nodes)) < workers:
         raise ValueError(
             f"num_workers={workers} with workers.cpus={share.cpus:g} and workers.gpus={share.gpus:g}: a worker cannot "
-            f"be spread over nodes or GPUs, and there is room for {room} of them on the cluster's {len(nodes)} nodes. "
-            "Lower num_workers, or the share of each so that several fit."
+            f"be split over nodes or GPUs, and the cluster's {len(nodes)} nodes have room for {room} workers. Lower "
+            "num_workers, workers.cpus or workers.gpus."
         )
 
 
@@ -211,7 +211,7 @@ def start_workers(
             storing_device="cpu",
         )
     except ray.exceptions.RayActorError as error:
-        raise ValueError(f"collector=ray: a worker could not begin ({in_a_line(error, last=True)}).") from error
+        raise ValueError(f"collector=ray: a worker could not start ({in_a_line(error, last=True)}).") from error
 
 
 def check_nodes(share: WorkersConfig, make_env: Callable[[], EnvBase], policy: DreamerPolicy) -> None:
@@ -240,14 +240,12 @@ def check_nodes(share: WorkersConfig, make_env: Callable[[], EnvBase], policy: D
             found = ray.get(answer, timeout=PROBE_TIMEOUT)
         except ray.exceptions.GetTimeoutError:
             ray.cancel(answer, force=True)
-            logger.warning(
-                "node %s had no room within %.0f s to see whether a worker can be had there", name, PROBE_TIMEOUT
-            )
+            logger.warning("node %s was not checked, because its resources were in use for %.0f s", name, PROBE_TIMEOUT)
             continue
         except ray.exceptions.RayError as error:
             raise ValueError(
-                f"collector=ray: node {name} cannot have a worker ({in_a_line(error, last=True)}). Every node of the "
-                "cluster needs this project in the same version at the same path, and all that worlds are made of "
+                f"collector=ray: node {name} cannot run a worker ({in_a_line(error, last=True)}). Every node of the "
+                "cluster needs the same version of this project at the same path, and everything that environments use "
                 "here, e.g. a renderer (env.renderer=)."
             ) from error
         check_versions(name, found, here)
@@ -266,8 +264,8 @@ def check_versions(node: str, found: Mapping[str, str | None], here: Mapping[str
     """
     if others := [f"{name} {found.get(name)} (here {own})" for name, own in here.items() if found.get(name) != own]:
         raise ValueError(
-            f"collector=ray: node {node} has {', '.join(others)}. Install the same there, or choose another cluster by "
-            "workers.address."
+            f"collector=ray: node {node} has {', '.join(others)}. Install the same versions there, or choose another "
+            "cluster with workers.address=."
         )
 
 

@@ -133,7 +133,7 @@ class RayRollouts(Rollouts):
     def begin_at(self, env_steps: int) -> None:
         """Continue a run that was resumed at ``env_steps``, in freshly reset environments."""
         self.rounds = env_steps // self._frames
-        logger.info("workers: their worlds begin anew, at round %d", self.rounds)
+        logger.info("workers: environments start new episodes, at round %d", self.rounds)
 
     def _ask(self, number: int) -> None:
         """Request a round of every worker, with new weights if those sent before would be too old by its end."""
@@ -164,7 +164,7 @@ class RayRollouts(Rollouts):
                 self.lost += 1
                 host, process = result.process
                 logger.warning(
-                    "worker %d was lost in round %d: process %d on %s took its place, and its worlds began anew",
+                    "worker %d was lost in round %d: process %d on %s replaces it, with newly reset environments",
                     worker,
                     self.rounds,
                     process,
@@ -189,16 +189,18 @@ class RayRollouts(Rollouts):
             _, pending = ray.wait(asked, num_returns=len(asked), timeout=min(LOOK, self._patience))
             waited, late = time.monotonic() - begun, _listed([asked.index(answer) for answer in pending])
             if pending and self.stopping() and waited >= STOP_TIMEOUT:
-                logger.warning("worker %s did not answer for %.0f s: this round is given up", late, waited)
+                logger.warning("worker %s did not answer for %.0f s: this round is abandoned", late, waited)
                 return False
             if pending and waited >= self._patience:
                 raise WorkerError(
-                    f"Of {len(asked)} workers, {late} did not answer for {waited:.0f} s "
-                    f"(workers.patience={self._patience:g}): {_room()}. Continue with fewer by num_workers=, or once "
-                    "the cluster has room again."
+                    f"Worker {late} of {len(asked)} did not answer for {waited:.0f} s "
+                    f"(workers.patience={self._patience:g}): {_room()}. Resume with a lower num_workers=, or when the "
+                    "cluster has free resources again."
                 )
             if pending and waited - reminded >= REMIND:
-                logger.warning("waiting for worker %s since %.0f s; one that was lost needs room", late, waited)
+                logger.warning(
+                    "waiting for worker %s for %.0f s; a lost worker restarts when resources are free", late, waited
+                )
                 reminded = waited
         return True
 
@@ -218,7 +220,7 @@ def _fetch(worker: int, asked: Any) -> WorkerResult:
         raise WorkerError(f"Worker {worker} failed ({ray_cluster.in_a_line(error, last=True)}).") from error
     except ray.exceptions.RayError as error:
         reason = ray_cluster.in_a_line(error, last=True)
-        raise WorkerError(f"Worker {worker} is lost and cannot be begun anew ({reason}).") from error
+        raise WorkerError(f"Worker {worker} is lost and cannot be restarted ({reason}).") from error
 
 
 def check_interval(weight_interval: int, frames: int) -> None:
@@ -233,9 +235,9 @@ def check_interval(weight_interval: int, frames: int) -> None:
     """
     if weight_interval < 2 * frames:
         raise ValueError(
-            f"workers.weight_interval={weight_interval}: a round of all workers is {frames} env_steps, and is flown "
-            f"while the one before is learned from, so weights are {2 * frames} env_steps old at its end: give at "
-            "least that, or lower rollout_steps."
+            f"workers.weight_interval={weight_interval}: a round of all workers is {frames} env_steps, and is "
+            f"collected while the learner trains on the one before. So weights are {2 * frames} env_steps old at its "
+            "end: set at least that, or lower rollout_steps."
         )
 
 

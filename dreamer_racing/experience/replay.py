@@ -223,7 +223,7 @@ class StreamReplay(TensorDictReplayBuffer):
             before += saved["num_streams"]
         if len(filled) != here.num_streams:
             raise ValueError(
-                f"The saved replays have {before} streams, too few for those from {skip} to {wanted.stop}: resume with "
+                f"The saved replays have {before} streams, but streams {skip} to {wanted.stop} are needed: resume with "
                 "the same number of environments."
             )
         here.load_state_dict({**streams, "cursor": cursor, "filled": filled, "write_count": sum(filled)})
@@ -239,8 +239,8 @@ class StreamReplay(TensorDictReplayBuffer):
         has, wants = (any(field["key"][0] == CONTEXT for field in state["fields"]), self.latents is not None)
         if state["fields"] and has is not wants:
             raise ValueError(
-                f"The saved replay was recorded {'with' if has else 'without'} the latents of its records, and this "
-                f"one keeps {'them' if wants else 'none'}: resume with replay.context={str(has).lower()}."
+                f"The saved replay was recorded {'with' if has else 'without'} latents, and this one is "
+                f"{'with' if wants else 'without'} latents: resume with replay.context={str(has).lower()}."
             )
         self._check_frames(path, state)
         return state
@@ -275,7 +275,7 @@ class StreamReplay(TensorDictReplayBuffer):
     def _check_fields(self, keys: list[NestedKey], fields: list[dict[str, Any]]) -> None:
         """Check that saved fields have the layout of the stored ones."""
         if any("frames" not in field for field in fields):
-            raise ValueError("The saved replay is of an older version, which did not compress it: it cannot be read.")
+            raise ValueError("The saved replay has the uncompressed format of an older version: it cannot be read.")
         layouts = {
             key: torch.empty(0, *field["shape"], dtype=_dtype(field)) for key, field in zip(keys, fields, strict=True)
         }
@@ -386,7 +386,7 @@ def make_replay(
     """
     stream_length = _stream_length(capacity, num_envs, batch_length)
     if not 0.0 <= recent_share <= 1.0:
-        raise ValueError(f"recent_share={recent_share}: a share lies between 0 and 1.")
+        raise ValueError(f"recent_share={recent_share}: must be between 0 and 1.")
     if not 0 <= held_out < num_envs:
         raise ValueError(f"held_out={held_out} of num_envs={num_envs} streams: at least one must be left to sample.")
     slots = stream_length * num_envs

@@ -92,7 +92,7 @@ class CollectorState:
         saved, present = len(state_dict["is_init"]), self._collector._carrier.batch_size[0]
         if saved != present:
             raise ValueError(
-                f"The checkpoint is of {saved} environments, this run has {present}: set env.num_envs={saved}."
+                f"The checkpoint has {saved} environments, this run has {present}: set env.num_envs={saved}."
             )
         self._collector._carrier.update(TensorDict(state_dict, self._collector._carrier.batch_size))
 
@@ -143,7 +143,7 @@ class RolloutStorage:
             KeyError: If the rollout lacks one of ``keys``.
         """
         if missing := [key for key in self.keys if rollout.get(key, None) is None]:
-            raise KeyError(f"The rollout lacks {missing}, which on-policy learning needs of policy and environment.")
+            raise KeyError(f"The rollout lacks {missing}, which on-policy learning needs from policy and environment.")
         steps = self._read(rollout.select(*self.keys).to(self.device).transpose(0, 1))
         length = len(steps)
         kept = self._make_room(steps)

@@ -223,7 +223,7 @@ class StreamWriter(Writer):
 
     def add(self, data: Any) -> int:
         """Raise ``NotImplementedError``, because only whole rollouts can be added."""
-        raise NotImplementedError("Streams grow by whole rollouts: use extend().")
+        raise NotImplementedError("Only whole rollouts can be added: use extend().")
 
     def extend(self, data: TensorDictBase) -> Tensor:
         """Write records with one indexed copy per key.
@@ -239,7 +239,7 @@ class StreamWriter(Writer):
         """
         stream, order = torch.stack([data["stream"], data["order"]]).cpu()
         if (found := int(stream.max()) + 1) != self.num_streams:
-            raise ValueError(f"The rollout is of {found} environments, the replay was made for {self.num_streams}.")
+            raise ValueError(f"The rollout has {found} environments, the replay was made for {self.num_streams}.")
         count = torch.bincount(stream, minlength=self.num_streams)  # (N,)
         slots = stream * self.stream_length + (self.cursor[stream] + order) % self.stream_length
         kept = order >= (count - self.stream_length)[stream]

@@ -219,17 +219,17 @@ def check_layers(saved: dict[str, Any], present: dict[str, Any]) -> None:
         there, here = (str(layers["image_size"] is not None).lower() for layers in (saved, present))
         raise ValueError(
             f"The checkpoint's networks were made with env.from_pixels={there}, this learner's with {here}: set "
-            f"env.from_pixels={there}, or begin anew."
+            f"env.from_pixels={there}, or start a new run."
         )
     if (there := saved.get("imu", False)) is not present["imu"]:  # older checkpoints lack it
         raise ValueError(
             f"The checkpoint's networks were made {'with' if there else 'without'} env.imu, and this learner's are "
-            f"{'not' if there else 'made with it'}: set it as it was, or begin anew."
+            f"made {'without' if there else 'with'} it: set it as it was, or start a new run."
         )
     names = {"layers": "network.layers", "units": "network.units", "image_size": "env.image_size"}
     for key, setting in names.items():
         if saved[key] != present[key]:
             raise ValueError(
                 f"The checkpoint's networks were made with {setting}={saved[key]}, this learner's with {present[key]}: "
-                f"set {setting}={saved[key]}, or begin anew."
+                f"set {setting}={saved[key]}, or start a new run."
             )

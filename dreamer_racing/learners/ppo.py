@@ -128,7 +128,9 @@ class PPOLearner(BaselineLearner):
             ValueError: If there are fewer records than minibatches.
         """
         if rollout.numel() < self.config.minibatches:
-            raise ValueError(f"minibatches={self.config.minibatches} of {rollout.numel()} records: they must be fewer.")
+            raise ValueError(
+                f"minibatches={self.config.minibatches}: must be at most {rollout.numel()}, the rollout's records."
+            )
         with timed("advantages"):
             records = self.with_advantages(rollout)
         steps: list[dict[str, Tensor]] = []

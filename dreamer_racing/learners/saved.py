@@ -38,8 +38,8 @@ def check_saved(saved: dict[str, Any], algorithm: str, agent: Agent, own_network
     check_format(saved)
     if saved["algorithm"] != algorithm:
         raise ValueError(
-            f"The checkpoint was trained by {saved['algorithm']}, and this learner is of {algorithm}: choose the one "
-            "that it was trained with, or begin a run with its weights (init_from=)."
+            f"The checkpoint was trained with {saved['algorithm']}, and this learner is {algorithm}: use "
+            f"{saved['algorithm']}, or start a new run with its weights (init_from=)."
         )
     check_size(saved["size"], agent.size)
     parts: Parts = {"networks": (agent.state_dict(), saved["agent"])}
@@ -91,7 +91,7 @@ def check_format(saved: dict[str, Any]) -> None:
         ValueError: If it has an older format.
     """
     if "own_networks" not in saved:
-        raise ValueError("The checkpoint was saved in a format that this version does not read: train anew.")
+        raise ValueError("The checkpoint was saved in a format that this version does not read: train again.")
 
 
 def load_parameters(module: nn.Module, saved: Mapping[str, Tensor]) -> None:
@@ -142,7 +142,7 @@ def _check_parts(parts: Parts, saved: dict[str, Any], agent: Agent) -> None:
     """Raise ``ValueError`` if the names or shapes of expected and saved parameters differ."""
     there, here = saved["image_size"], agent.interface.image_size
     where = (
-        "in an environment of other observations or actions"
+        "in an environment with other observations or actions"
         if there == here
         else f"on images of {there} × {there} pixels, not {here} × {here}: choose env.image_size={there}"
     )
@@ -150,13 +150,13 @@ def _check_parts(parts: Parts, saved: dict[str, Any], agent: Agent) -> None:
         lacking, surplus = sorted(wanted.keys() - found.keys()), sorted(found.keys() - wanted.keys())
         if lacking or surplus:
             raise ValueError(
-                f"The checkpoint's {part} has {', '.join(surplus[:2]) or 'nothing'} beyond this learner's, and "
-                f"lacks {', '.join(lacking[:2]) or 'nothing'}: it was trained with another loss, or in an "
-                "environment of other observations. Choose those it was trained with."
+                f"Compared with this learner's {part}, the checkpoint's has {', '.join(surplus[:2]) or 'nothing'} in "
+                f"addition, and lacks {', '.join(lacking[:2]) or 'nothing'}: it was trained with another loss or other "
+                "observations. Use those it was trained with."
             )
         for key, value in wanted.items():
             if value.shape != found[key].shape:
                 raise ValueError(
-                    f"The checkpoint's {part} has {key} of shape {list(found[key].shape)}, this learner's of "
+                    f"The checkpoint's {part} has {key} of shape {list(found[key].shape)}, this learner's has shape "
                     f"{list(value.shape)}: it was trained {where}."
                 )

@@ -214,8 +214,8 @@ class WorldModelLearner(ABC):
             return {}
         if batch.get(CONTEXT, None) is None:
             raise KeyError(
-                f"drift_scale={scale:g} holds the policy at the latents that records keep, and the batch has no "
-                f"{CONTEXT!r}: replay with them (replay.context=true), or set drift_scale=0."
+                f"drift_scale={scale:g} compares the policy at stored and at new latents, but the batch has no "
+                f"{CONTEXT!r}: store latents (replay.context=true), or set drift_scale=0."
             )
         before, after, same = self.stored_and_current_features(latents, batch)
         drift = policy_drift(self.agent.actor, before, after, same.float())
@@ -313,10 +313,10 @@ class WorldModelLearner(ABC):
         """
         if others:
             raise TypeError(
-                f"adjust({', '.join(sorted(others))}=...): a learner of {self.algorithm} has no such number."
+                f"adjust({', '.join(sorted(others))}=...): a learner of {self.algorithm} has no such hyperparameter."
             )
         if rates is None and world_model_rate != 1.0:
-            raise ValueError(f"adjust(world_model_rate={world_model_rate:g}) is a share of rates: give rates=, too.")
+            raise ValueError(f"adjust(world_model_rate={world_model_rate:g}) is a factor on rates: give rates=, too.")
         if rates is not None:
             for group, rate, share in zip(
                 self.optimizer.param_groups, self._rates, (world_model_rate, 1.0), strict=True

@@ -197,10 +197,10 @@ ON_POLICY = ("clipped",)
 """Objectives of collected steps; the others are of imagined steps."""
 
 REMOVED = {
-    "ppo": "PPO learns from what was collected, by the algorithm latent_ppo",
-    "flown_ppo": "its critic learns from what was collected, too, by the algorithm latent_ppo",
-    "latent_ppo": "it is an algorithm of its own now, recipes/latent_ppo.py loss.critic=latent",
-    "asymmetric_ppo": "it is an algorithm of its own now, recipes/latent_ppo.py loss.critic=state",
+    "ppo": "use recipes/latent_ppo.py, where PPO learns from collected steps",
+    "flown_ppo": "use recipes/latent_ppo.py, where the critic learns from collected steps, too",
+    "latent_ppo": "use recipes/latent_ppo.py loss.critic=latent",
+    "asymmetric_ppo": "use recipes/latent_ppo.py loss.critic=state",
 }
 """Names of removed objectives, and what replaces them."""
 
@@ -219,16 +219,16 @@ def find_objective(name: str, collected: bool | None = None) -> Objective:
     if ":" in name:
         found = import_own(name, f"Objective {name!r}")
         if not callable(found):
-            raise ValueError(f"Objective {name!r} is no function of a Trajectory.")
+            raise ValueError(f"Objective {name!r} is not a function of a Trajectory.")
         return found
     if name in REMOVED:
-        raise ValueError(f"The actor {name!r} is gone: {REMOVED[name]}.")
+        raise ValueError(f"The actor {name!r} was removed: {REMOVED[name]}.")
     if name not in OBJECTIVES:
         raise ValueError(
-            f"Unknown objective {name!r}{suggestion(name, OBJECTIVES)}. Known here: {', '.join(OBJECTIVES)}; one of "
-            "your own is given as module:function."
+            f"Unknown objective {name!r}{suggestion(name, OBJECTIVES)}. Known objectives: {', '.join(OBJECTIVES)}. "
+            "Give your own as module:function."
         )
     if collected is not None and collected is not (name in ON_POLICY):
         steps, takes = ("imagined", "dreamer_v3") if collected else ("collected", "latent_ppo")
-        raise ValueError(f"loss.actor={name} learns from {steps} steps: recipes/{takes}.py takes it.")
+        raise ValueError(f"loss.actor={name} learns from {steps} steps: use it with recipes/{takes}.py.")
     return OBJECTIVES[name]

@@ -245,7 +245,7 @@ class Target(nn.Module):
             embedding: Encoded observations, ``(B, T, E)``.
             batch: The records ``[B, T]``.
         """
-        raise NotImplementedError(f"{type(self).__name__} must say what it minimises.")
+        raise NotImplementedError(f"{type(self).__name__} must implement forward().")
 
 
 class Image(Target):
@@ -409,13 +409,13 @@ def find_targets(names: str) -> tuple[type[Target], ...]:
         if ":" in name:
             own = import_own(name, f"Target {name!r}")
             if not (isinstance(own, type) and issubclass(own, Target)):
-                raise ValueError(f"Target {name!r} is no subclass of dreamer_racing.losses.Target.")
+                raise ValueError(f"Target {name!r} is not a subclass of dreamer_racing.losses.Target.")
             found.append(own)
         elif name in TARGETS:
             found += TARGETS[name]
         else:
             raise ValueError(
-                f"Unknown loss {name!r}{suggestion(name, TARGETS)}. Known here: {', '.join(TARGETS)}; a target of your "
-                "own is given as module:Class, and several are joined by +."
+                f"Unknown loss {name!r}{suggestion(name, TARGETS)}. Known losses: {', '.join(TARGETS)}. Give your own "
+                "target as module:Class; join several with +."
             )
     return tuple(dict.fromkeys(found))

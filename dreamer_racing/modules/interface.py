@@ -58,7 +58,7 @@ class Interface:
         keys = set(specs.keys(include_nested=True))
         height, width = specs[PIXELS].shape[-3:-1] if PIXELS in keys else [cls.image_size] * 2
         if height != width:
-            raise ValueError(f"The environment's images are {height} × {width} pixels: agents see square ones.")
+            raise ValueError(f"The environment's images are {height} × {width} pixels: agents need square images.")
         numbers = IMU if IMU in keys else VECTOR
         vector, privileged = (specs[key].shape[-1] if key in keys else 0 for key in (numbers, PRIVILEGED))
         return cls(env.action_spec.shape[-1], PIXELS in keys, height, vector, privileged, numbers)

@@ -143,7 +143,7 @@ class RunCheckpoints:
                 self._remove_later(final)
                 self._remove_oldest()
             except OSError as error:  # the checkpoint itself is complete
-                logger.warning("Checkpoints beside %s that are not kept could not be removed: %s.", final.name, error)
+                logger.warning("Obsolete checkpoints beside %s could not be removed: %s.", final.name, error)
         return final
 
     def _step(self, action: Callable[[], object], of_this_process: bool) -> None:
@@ -213,8 +213,8 @@ class RunCheckpoints:
             except (OSError, ValueError) as error:
                 raise RunCheckpointError(f"The checkpoint {source} could not be restored. {error}") from error
         logger.info(
-            "%s was saved by another number of processes (%d there, %d here): its replay is dealt anew; worlds, random "
-            "numbers and steps kept for the next improvement begin anew.",
+            "%s was saved by another number of processes (%d there, %d here): its replay is redistributed. Episodes, "
+            "random numbers and the collection of steps for the next policy update start again.",
             source.name,
             saved,
             parallel.num_processes(),
@@ -223,7 +223,7 @@ class RunCheckpoints:
     def _remove_later(self, newest: Path) -> None:
         for path in self._complete():
             if path.name > newest.name:
-                logger.warning("Removing %s: the run was resumed from before it.", path)
+                logger.warning("Removing %s: the run was resumed from an earlier checkpoint.", path)
                 remove(path)
 
     def _remove_oldest(self) -> None:
@@ -270,7 +270,7 @@ class BestCheckpoint:
         shutil.rmtree(aside, ignore_errors=True)
         self.directory.rename(aside)
         logger.warning(
-            "the best policy so far, of %s env_steps, is from after where the run goes on: it is in %s",
+            "the best policy so far, of %s env_steps, is later than the resumed checkpoint: it was moved to %s",
             f"{kept['env_steps']:,}",
             aside,
         )
@@ -339,7 +339,7 @@ def newest_sound(path: str | Path, parts: Collection[str] | None = None) -> Path
         if damage is None:
             if damaged:
                 found = ". ".join(damaged.values())
-                logger.warning("%s. Going on from %s; what came after it is lost.", found, candidate.name)
+                logger.warning("%s. Continuing from %s; later training is lost.", found, candidate.name)
             return candidate
         damaged[candidate.name] = f"{candidate} is damaged: {damage}"
     others = [other.name for other in complete_checkpoints(candidate.parent) if other.name not in damaged]
@@ -398,5 +398,5 @@ def _restore(checkpoint: Checkpoint, source: Path, map_location: torch.device | 
         return checkpoint.load(source, map_location=str(map_location)).manifest["metadata"]
     except CheckpointError as error:
         # torch's own message advises to load the file without its safeguard
-        reason = "A file of it holds what is no state." if "weights_only" in str(error) else error
+        reason = "One of its files does not contain a saved state." if "weights_only" in str(error) else error
         raise RunCheckpointError(f"The checkpoint {source} could not be restored. {reason}") from error

@@ -157,7 +157,7 @@ class RunDirectory:
         except FileNotFoundError:
             return 0
         except (ValueError, TypeError, KeyError):
-            logger.warning("%s is damaged: the run is taken for one that goes on.", self.finished)
+            logger.warning("%s is damaged: the run is treated as unfinished.", self.finished)
             return 0
 
     def latest_evaluation(self) -> str | None:
@@ -181,7 +181,7 @@ class RunDirectory:
                     moved.add(int(number))
         if moved:
             logger.warning(
-                "evaluations at %s env_steps are from after where the run goes on: their files are in *%s of %s",
+                "evaluations at %s env_steps are later than the resumed checkpoint: their files are in *%s of %s",
                 ", ".join(f"{number:,}" for number in sorted(moved)),
                 REPLACED,
                 self.path,
@@ -205,7 +205,7 @@ class RunDirectory:
                 starts.append(json.loads(line))
             except ValueError:
                 if line.endswith("\n"):  # a kill may truncate the last line
-                    logger.warning("A line of %s is damaged, and left out.", self.starts)
+                    logger.warning("A line of %s is damaged, and is ignored.", self.starts)
         return starts
 
 
@@ -230,14 +230,14 @@ def complete_checkpoints(path: str | Path) -> list[Path]:
         for candidate in candidates:
             if candidate not in found:
                 newer = found and env_steps_of(candidate) > env_steps_of(found[0])
-                lost = f"; what came after {found[0].name} is lost" if newer else ""
-                logger.warning("Passing over %s: it is not a complete checkpoint%s.", candidate, lost)
+                lost = f"; training after {found[0].name} is lost" if newer else ""
+                logger.warning("Skipping %s: it is not a complete checkpoint%s.", candidate, lost)
         if found:
             return found
     run = RunDirectory(path.parent)
     if path == run.best.path and (run.config.exists() or run.starts.exists()):
         raise FileNotFoundError(
-            f"No complete checkpoint at {path}: the run's first evaluation makes it, and there was none yet. Wait for "
+            f"No complete checkpoint at {path}: the run's first evaluation writes it, and there was none yet. Wait for "
             f"it (evaluation.first=, evaluation.every=), or give {run.path} for its newest checkpoint."
         )
     state = "exists, but holds none" if path.exists() else "does not exist"
@@ -370,7 +370,7 @@ class RunLock:
                 "run_dir."
             ) from error
         except OSError as error:
-            logger.warning("%s cannot be locked (%s): see to it yourself that no other run uses it.", directory, error)
+            logger.warning("%s cannot be locked (%s): make sure that no other run uses it.", directory, error)
         self._file.truncate(0)
         self._file.write(f"process {os.getpid()} on {socket.gethostname()}, since {datetime.now():%Y-%m-%d %H:%M:%S}")
         self._file.flush()

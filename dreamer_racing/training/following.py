@@ -55,7 +55,7 @@ class NoReport:
 
     def make(self, env_steps: int, stochastic: bool = False) -> dict[str, float]:
         """Raise ``RuntimeError``: only rank 0 may call this."""
-        raise RuntimeError("The first process alone evaluates.")
+        raise RuntimeError("Only the first process evaluates.")
 
     def close(self) -> None:
         """Do nothing."""

@@ -132,7 +132,7 @@ class MetricsLog:
                     try:
                         end()
                     except OSError as error:
-                        logger.warning("What %s has last been told may be lost: %s.", type(sink).__name__, error)
+                        logger.warning("The last metrics sent to %s may be lost: %s.", type(sink).__name__, error)
 
     def __enter__(self) -> MetricsLog:
         return self
@@ -210,7 +210,7 @@ def _read_rows(path: Path) -> list[dict[str, str]]:
     damaged = [row[X_AXIS] for row in rows if not _is_count(row[X_AXIS])]
     if damaged:
         logger.warning(
-            "%s is damaged: %s is no number of env_steps. %d of %d rows are left out for that.",
+            "%s is damaged: %s is not a number of env_steps. %d of %d rows are ignored.",
             path, quoted(damaged[0]), len(damaged), len(rows),
         )  # fmt: skip
     return [row for row in rows if _is_count(row[X_AXIS])]

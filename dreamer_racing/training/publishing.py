@@ -101,7 +101,7 @@ def damage_of(path: Path, parts: Collection[str] | None) -> str | None:
         if name not in sums:
             return f"{CHECKSUMS} lacks {name}"
         if _checksum(path / name) != sums[name]:
-            return f"{name} is not what was saved"
+            return f"{name} does not match its checksum"
     return None
 
 

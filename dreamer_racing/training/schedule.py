@@ -73,9 +73,7 @@ class Ramp:
             ValueError: It is not so; the message gives both ends.
         """
         if not 0.0 <= self.begin <= self.end <= 1.0:
-            raise ValueError(
-                f"{name}: begin={self.begin} and end={self.end} are shares, so it takes 0 <= begin <= end <= 1."
-            )
+            raise ValueError(f"{name}: begin={self.begin} and end={self.end} must satisfy 0 <= begin <= end <= 1.")
 
     def at(self, value: float, times: Mapping[RampClock, float]) -> float:
         """Return the value at a time.
@@ -134,14 +132,14 @@ class ScheduleConfig:
                 raise ValueError(f"schedule.{name} is for races, and env.suite={suite}: leave it out.")
             if suite != "race" and ramp.by is not RampClock.run:
                 raise ValueError(
-                    f"schedule.{name}.by={ramp.by.value} goes by gates, and env.suite={suite} has none: by=run."
+                    f"schedule.{name}.by={ramp.by.value} depends on gates, and env.suite={suite} has none: set by=run."
                 )
             allowed = POSITIVE if name in RATE_FACTORS else allowed_values(owner_of(name, owners), name)
             if allowed is not None and ramp.to not in allowed:
                 raise ValueError(f"schedule.{name}.to={ramp.to}: must be {allowed}.")
         self.check_deviations(owners["loss"])
         if self.start_on_line.to is not None and not owners["env"].start_on_line:
-            raise ValueError("schedule.start_on_line begins at env.start_on_line=0: give that a share above 0.")
+            raise ValueError("schedule.start_on_line starts from env.start_on_line=0: set that above 0.")
 
     def check_deviations(self, loss: Any) -> None:
         """Check that ``min_std`` stays below ``max_std`` during the ramps of both.
@@ -163,7 +161,7 @@ class ScheduleConfig:
         pairs = zip(lowest, highest, strict=True) if together and moving else product(lowest, highest)
         for (low, least), (high, most) in pairs:
             if least is not None and most is not None and least >= most:
-                raise ValueError(f"{low}={least} must be below {high}={most}: the bounds of the actions' deviation.")
+                raise ValueError(f"{low}={least} must be below {high}={most}: the bounds of the standard deviation.")
 
 
 @dataclass
@@ -189,14 +187,14 @@ class LatentPPOScheduleConfig(ScheduleConfig):
         ppo, to = owners["loss.ppo"], self.kl_target.to
         if ppo.kl_target is None and to is not None:
             raise ValueError(
-                f"schedule.kl_target.to={to} begins at loss.ppo.kl_target=null: give that a number, or leave the ramp "
-                "out with schedule.kl_target.to=null."
+                f"schedule.kl_target.to={to} starts from loss.ppo.kl_target=null: set that to a number, or turn the "
+                "ramp off with schedule.kl_target.to=null."
             )
         for name, target in (("loss.ppo.kl_target", ppo.kl_target), ("schedule.kl_target.to", to)):
             if target is not None and ppo.kl_stop < KL_TOLERANCE * target:
                 raise ValueError(
-                    f"loss.ppo.kl_stop={ppo.kl_stop} ends updates before {name}={target} is seen to be exceeded: the "
-                    f"stop must be at least {KL_TOLERANCE} times the target."
+                    f"loss.ppo.kl_stop={ppo.kl_stop} must be at least {KL_TOLERANCE} times {name}={target}: otherwise "
+                    "updates stop before the target is clearly exceeded."
                 )
 
 
@@ -322,7 +320,7 @@ class ReplayRatio:
             self._since, self._before = saved._since, saved._before
             return
         self._since, self._before = self._env_steps, saved.updates(self._env_steps)
-        logger.info("updates: from here on by a replay ratio of %g, %d records each", self.ratio, self.records)
+        logger.info("updates: from now on with a replay ratio of %g and %d records each", self.ratio, self.records)
 
 
 class ModelLag:
@@ -395,7 +393,7 @@ class ModelLag:
         if self.waits is not waited:
             reason = f"the model's error on the newest records is {ratio:.2f} times that in training"
             logger.info(
-                "the actor %s: %s (wait_for_model=%g)", "waits" if self.waits else "goes on", reason, self.limit
+                "the actor %s: %s (wait_for_model=%g)", "waits" if self.waits else "continues", reason, self.limit
             )
         return {"lag/error": fresh, "lag/ratio": ratio, "lag/actor_waits": float(self.waits)}
 

@@ -353,7 +353,7 @@ class Session:
         except (OSError, RunCheckpointError) as error:
             self._unsaved.setdefault(what, self.env_steps)
             reason = str(error).rstrip(".")
-            self.write_line(f"NOT SAVED: {what}: {reason}. The run goes on, and tries again when the next is due.")
+            self.write_line(f"NOT SAVED: {what}: {reason}. The run continues, and tries again at the next save.")
         else:
             self._unsaved.pop(what, None)
 
@@ -411,5 +411,5 @@ class Session:
 
 def graceful_exit() -> GracefulExit:
     """Make the stop flag that a signal sets in all processes; only rank 0 prints an answer."""
-    answer = "saving; again: abandons what is since the last checkpoint" if parallel.is_first() else ""
+    answer = "saving; a second signal discards all since the last checkpoint" if parallel.is_first() else ""
     return GracefulExit(answer, parallel.all_reduce_max if parallel.num_processes() > 1 else None)

@@ -109,7 +109,7 @@ def make_env(config: RunConfig, num_envs: int | None = None, num_threads: int | 
     if readers:
         raise ValueError(
             f"{' and '.join(readers)}: read the race's privileged state, which env=dmc does not have. Choose other "
-            "losses, e.g. loss=reconstruction, and of recipes/latent_ppo.py loss.critic=latent."
+            "losses, e.g. loss=reconstruction, and with recipes/latent_ppo.py loss.critic=latent."
         )
     return make_suite(config, num_envs, config.seed, config.env.episode_steps)
 
@@ -186,22 +186,22 @@ def load_initial_weights(learner: WorldModelLearner, config: WorldModelRunConfig
         for name in OBSERVATION_SETTINGS:
             there, here = OmegaConf.select(saved, name), OmegaConf.select(OmegaConf.structured(config), name)
             if there != here:
-                raise ValueError(f"{name}={here}: init_from={source} was trained with {name}={there}; give that.")
+                raise ValueError(f"{name}={here}: init_from={source} was trained with {name}={there}; use the same.")
         state, metadata = load_state(folder, "learner")
         unmatched = learner.adopt(state)
-        kind = "the averaged ones" if "averaged" in state else "all those"
-        line = f"weights: {kind} of {folder} at {metadata['env_steps']:,} env_steps (init_from=), heads and critic, too"
+        kind = "averaged" if "averaged" in state else "trained"
+        line = f"weights: {kind}, of {folder} at {metadata['env_steps']:,} env_steps (init_from=), heads and critic too"
         if unmatched.initial:
-            line += f"; {' and '.join(unmatched.initial)}, which that run had not, begins anew"
-        return line + (f"; left behind: {' and '.join(unmatched.unused)}" if unmatched.unused else "")
+            line += f"; not in that run, so untrained: {' and '.join(unmatched.initial)}"
+        return line + (f"; not loaded: {' and '.join(unmatched.unused)}" if unmatched.unused else "")
     contract = read_contract(folder / CONTRACT)
     check_size(contract["model"], learner.size)
     if not isinstance(env, DroneRacingEnv):
-        raise ValueError(f"init_from={source}: this agent races; there is no race here.")
+        raise ValueError(f"init_from={source}: this agent was trained on races, and this run has none.")
     check_env(folder, contract, env)
     for agent in filter(None, (learner.agent, learner.averaged)):
         load_networks(folder, agent)
-    return f"weights: encoder, RSSM and actor of {folder} (init_from=); heads and critic begin anew"
+    return f"weights: encoder, RSSM and actor of {folder} (init_from=); heads and critic start untrained"
 
 
 def make_learner(
@@ -223,7 +223,7 @@ def make_learner(
         return PPOLearner(NetworkSize(config.network.layers, config.network.units), interface, config.ppo, device, seed)
     if isinstance(config, SACRunConfig):
         return SACLearner(NetworkSize(config.network.layers, config.network.units), interface, config.sac, device, seed)
-    raise NotImplementedError(f"make_learner() knows no learner of a {type(config).__name__}: add a branch for it.")
+    raise NotImplementedError(f"make_learner() has no branch for {type(config).__name__}: add one.")
 
 
 def measure(
@@ -358,10 +358,10 @@ def disk_needed(config: ReplayRunConfig, replay: int) -> str:
     there = sum(file.stat().st_size for file in directory.checkpoints.rglob("*") if file.is_file())
     peak, free = (config.checkpoint.keep + 1) * replay, shutil.disk_usage(directory.path).free + there
     line = (
-        f"disk: at most {peak / 1e9:.1f} GB of replay in checkpoint.keep={config.checkpoint.keep} checkpoints and the "
-        f"one that is being written, a seventh of that if images compress as a race's do; {free / 1e9:.1f} GB free"
+        f"disk: at most {peak / 1e9:.1f} GB for the replay in checkpoint.keep={config.checkpoint.keep} checkpoints and "
+        f"the one being written, about a seventh of that for images of races; {free / 1e9:.1f} GB free"
     )
-    advice = "lower checkpoint.keep= or replay.capacity=, or choose another run_dir=; a run goes on without saving"
+    advice = "lower checkpoint.keep= or replay.capacity=, or choose another run_dir=; else saving may fail"
     return f"{line}: MAY NOT BE ENOUGH, {advice}" if peak > free else line
 
 

@@ -19,7 +19,7 @@ def check_overrides(config: DictConfig, overrides: Sequence[str]) -> None:
     if suite != "race" and config.decoys:
         raise ValueError(f"decoys={config.decoys} are for races, and env.suite={suite}: leave them out.")
     if "track_description" in given:
-        raise ValueError("track_description= is what a run notes of its track's file: give that, track=my_track.yaml.")
+        raise ValueError("track_description= is set by the run from its track file: give track=my_track.yaml.")
     if suite != "race" and "track" in given:
         raise ValueError(f"track={config.track} is for races, and env.suite={suite}: leave one of them out.")
 
@@ -46,7 +46,7 @@ def check_read(config: DictConfig, overrides: Sequence[str]) -> None:
         ("loss.privileged_scale", have(State), "loss=privileged or informed"),
         ("loss.barlow_scale", have(Barlow), "loss=decoder_free"),
         ("model.imagination_starts", config.algorithm == "dreamer_v3", "recipes/dreamer_v3.py, which imagines"),
-        ("loss.drift_scale", drift, "records that keep latents, replay.context=true, as they are, model.sampled=false"),
+        ("loss.drift_scale", drift, "stored latents (replay.context=true) without sampling (model.sampled=false)"),
         ("replay.recent_records", config.replay.recent_share > 0, "replay.recent_share above 0"),
         ("replay.device", config.replay.storage is Storage.tensor, "replay.storage=tensor"),
         ("schedule.wait_every", waits, "schedule.wait_for_model"),

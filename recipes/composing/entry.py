@@ -52,7 +52,7 @@ def plain_disk_errors() -> Iterator[None]:
     try:
         yield
     except OSError as error:
-        print(f"error: {error}. What was written so far is no whole result.", file=sys.stderr)
+        print(f"error: {error}. The results written so far are incomplete.", file=sys.stderr)
         raise SystemExit(1) from error
 
 
@@ -111,10 +111,10 @@ SCHEMAS: dict[str, type] = {}
 WHOLE = re.compile(r"\d{1,9}(\.\d{1,9})?[eE]\+?\d{1,2}")
 """Pattern of a number such as 1e6."""
 PLAIN = {
-    r"could not be converted to Integer": "is no whole number",
-    r"could not be converted to Float": "is no number",
+    r"could not be converted to Integer": "is not a whole number",
+    r"could not be converted to Float": "is not a number",
     r"is not a valid bool \(type \w+\)": "is neither true nor false",
-    r"Invalid type assigned: .*Ramp.*": "a schedule has an end and times of its own, NAME.to=, .begin=, .end=",
+    r"Invalid type assigned: .*Ramp.*": "a schedule is set by NAME.to=, NAME.begin= and NAME.end=",
 }
 """Patterns of the libraries' messages, and the words to print instead."""
 TEXTS = (

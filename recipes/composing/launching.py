@@ -127,9 +127,7 @@ def training_session(config: RunConfig, overrides: list[str], remedy: str) -> It
     try:
         with plain_errors(lambda: not session.began):
             if config.device == "cpu" and not keep_freed_memory():
-                print(
-                    "memory: freed blocks go back to the system, for this C library cannot keep them; updates slow down"
-                )
+                print("memory: this C library cannot keep freed memory for reuse; updates are slower")
             yield session
     except KeyboardInterrupt as interrupt:
         if not session.began:
@@ -210,8 +208,8 @@ def save_batch(error: NonFiniteLossError, path: Path) -> str:
     try:
         torch.save(error.batch.to("cpu").to_dict(), path)
     except (OSError, RuntimeError) as refused:  # torch raises RuntimeError on a full disk
-        return f"The batch could not be kept ({' '.join(str(refused).split())})"
-    return f"The batch is kept in {path}"
+        return f"The batch could not be saved ({' '.join(str(refused).split())})"
+    return f"The batch is saved in {path}"
 
 
 def resumed_config(algorithm: str, resume: str, overrides: list[str]) -> tuple[DictConfig, list[str]]:
@@ -221,12 +219,12 @@ def resumed_config(algorithm: str, resume: str, overrides: list[str]) -> tuple[D
         ValueError: the run is incomplete or of another algorithm, or an override would make it a different run.
     """
     if is_agent(resume) or (not Path(resume).exists() and is_agent(agent_path(resume))):
-        raise ValueError(f"resume={resume} is an agent, which no run goes on from: begin one with init_from={resume}.")
+        raise ValueError(f"resume={resume} is an agent, not a run to resume: start one with init_from={resume}.")
     directory = RunDirectory.of(latest_checkpoint(resume))
     run_dir = directory.path
     if directory.run != directory:
         raise ValueError(
-            f"resume={resume} are the networks of a run's best evaluation alone: resume={directory.run.path}."
+            f"resume={resume} holds only the networks of a run's best evaluation: set resume={directory.run.path}."
         )
     for file in (directory.config, directory.overrides):
         if not file.exists():
@@ -237,11 +235,11 @@ def resumed_config(algorithm: str, resume: str, overrides: list[str]) -> tuple[D
     for override in overrides:
         name = override_key(override)
         if name == "run_dir" and Path(str(override_value(override))).absolute() != run_dir:
-            raise ValueError(f"{override}: the run goes on in its own directory, {run_dir}. Leave it out.")
+            raise ValueError(f"{override}: a resumed run stays in its own directory, {run_dir}. Leave it out.")
         if name in TRAINED_ON and override_value(override) != (trained := OmegaConf.select(known, name)):
             raise ValueError(
-                f"{run_dir} was trained with {name}={trained}, and goes on with it: {override} would be "
-                "another run. Leave it out, or begin anew."
+                f"{run_dir} was trained with {name}={trained}, which cannot change: leave {override} out, or start a "
+                "new run."
             )
     begun_with = [
         text for text in map(str, read_yaml(directory.overrides, ListConfig)) if override_key(text) != "run_dir"
@@ -266,7 +264,7 @@ def is_finished(config: DictConfig) -> bool:
     env_steps = env_steps_of(checkpoint)
     if env_steps < config.total_env_steps:
         return False
-    print(f"complete already, at {env_steps:,} env_steps: give a larger total_env_steps to go on")
+    print(f"already complete, at {env_steps:,} env_steps: set a larger total_env_steps to continue")
     return True
 
 
@@ -280,13 +278,13 @@ def next_steps(config: RunConfig, directory: RunDirectory) -> str:
     place, longer = from_here(directory.path), 2 * max(config.total_env_steps, directory.finished_env_steps())
     given = {name: shlex.quote(as_override(name, place)) for name in ("checkpoint", "agent", "runs", "resume")}
     moving = config.schedule.by_length if isinstance(config, WorldModelRunConfig) else []
-    sets_back = f"  # sets back what moves with the share of the run: {', '.join(moving)}" if moving else ""
+    schedule_note = f"  # moves back the schedules that follow the run's length: {', '.join(moving)}" if moving else ""
     noisy = " start_noise=1" if is_race(config) else ""  # without noise all deterministic flights are the same
     commands = {
         "evaluate it": f"{command('evaluate')} {given['checkpoint']} episodes=100{noisy}",
         "watch it fly": f"{command('fly')} {given['agent']}" if is_race(config) else "",
         "draw it": f"{command('plot')} {given['runs']} output=figures",
-        "go on": f"{command(config.algorithm)} {given['resume']} total_env_steps={longer}{sets_back}",
+        "continue": f"{command(config.algorithm)} {given['resume']} total_env_steps={longer}{schedule_note}",
     }
     files = {what: from_here(path) for what, path in left.items() if path.exists()}
     return "\n".join(f"{what + ':':<14}{words}" for what, words in {**files, **commands}.items() if words)

@@ -66,6 +66,6 @@ def how_to_run(script: str) -> str:
     if not (ROOT / "dev").is_file():
         return "Install it in this Python: pip install dreamer_racing."
     return (
-        f"{ROOT / 'dev'} python {Path(script).absolute()} runs it in the project's environment, which the first start "
-        f"makes; in one of your own, pip install -e {ROOT} comes first (docs/installation.md)."
+        f"Run {ROOT / 'dev'} python {Path(script).absolute()}: it uses the project's environment, which the first "
+        f"start creates. Or install the project in your own: pip install -e {ROOT} (docs/installation.md)."
     )

@@ -89,8 +89,8 @@ def names(recipe: str) -> list[str]:
 
 RENAMED = {
     "loss.ppo.flown": "it is called loss.ppo.steps now",
-    "loss.ppo.updates": "actors no longer learn by PPO from what they imagine",
-    "loss.kl_mode": "free nats apply to the sum over latents, as in the reference",
+    "loss.ppo.updates": "was removed, because PPO no longer learns from imagined steps",
+    "loss.kl_mode": "was removed: free nats apply to the sum over latents, as in the reference",
 }
 """Explanations for settings that were renamed or removed."""
 
@@ -101,7 +101,7 @@ def no_such_setting(name: str, recipe: str) -> str:
         return f"{name}: {RENAMED[name]}. docs/options.md has all settings."
     known = names(recipe)
     if name in known:  # a group that is not among the defaults
-        return f"{name}: is added, with a plus: +{name}=..."
+        return f"{name}: must be added with a plus: +{name}=..."
     last = {full.rpartition(".")[2]: full for full in known}
     if takers := [f"recipes/{other}.py" for other in TRAINING if recipe in TRAINING and name in names(other)]:
         return f"{name}: there is no such setting of recipes/{recipe}.py; it is for {' and '.join(takers)}."
@@ -137,7 +137,7 @@ def check_arguments(recipe: str, arguments: Sequence[str]) -> None:
             raise ValueError(no_such_setting(name, recipe))
         if name in found and value.replace(" ", "").startswith("[["):  # hydra fails on it
             quoted = settings.shortened(value)
-            raise ValueError(f"{name}={quoted}: a group takes the name of one of its configurations.")
+            raise ValueError(f"{name}={quoted}: must be the name of one of the group's configurations.")
         if name in found and re.fullmatch(r"\w+", value) and value not in (*found[name], "null"):
             raise ValueError(no_such_choice(name, value, found[name]))
 
@@ -179,7 +179,7 @@ def usage(recipe: str) -> Iterator[str]:
         for name, choices in found.items():
             yield from _entry(f"{name}=", ", ".join(choices))
         yield ""
-    yield "Options (NAME=DEFAULT; `chosen` means: by the recipe, which prints it)"
+    yield "Options (NAME=DEFAULT; `chosen`: the recipe chooses the value and prints it)"
     family = ""
     for option in options(recipe):
         if (own := option.name.partition(".")[0] if "." in option.name else "") != family:

@@ -67,7 +67,7 @@ def note_track(config: DictConfig) -> None:
         return
     with suppress(TrackError):  # the file is gone or no longer valid
         if serialize_track_file(config.track) != config.track_description:
-            print(f"track: as {config.track} was when the run was begun, which it no longer is")
+            print(f"track: {config.track} has changed since the run started; the run keeps the old track")
 
 
 def resolve_baseline(config: DictConfig, num_envs: Mapping[str, int]) -> DictConfig:
@@ -98,12 +98,12 @@ def tune(config: DictConfig) -> str:
         f"budget={budget}": budget in ("smoke", "paper"),
     }
     if reasons := [setting for setting, other in others.items() if other]:
-        print(f"settings: tuned=none, the algorithm as published: none are chosen for {', '.join(reasons)}")
+        print(f"settings: tuned=none, the algorithm as published; there are no tuned settings for {', '.join(reasons)}")
         return "none"
     chosen = "race" if config.env.suite == "race" else "suite"
     if device != "cpu":
-        more = "; tuned=gpu has more worlds and updates, unmeasured, too" if chosen == "race" else ""
-        print(f"settings: tuned={chosen}, known from CPUs. model=size12m is the algorithm as published{more}")
+        more = "; tuned=gpu has more worlds and updates, but is not measured" if chosen == "race" else ""
+        print(f"settings: tuned={chosen}, measured on CPUs. model=size12m gives the algorithm as published{more}")
     return chosen
 
 
@@ -144,14 +144,12 @@ def print_tuned(config: DictConfig) -> None:
     if config.tuned not in ("auto", "none") and (CONFIG_DIR / "tuned" / f"{config.tuned}.yaml").is_file():
         files = [CONFIG_DIR / "tuned" / folder / f"{config.tuned}.yaml" for folder in ("", config.algorithm)]
         said_there = [line for file in files if file.exists() for line in head_of(file)]
-        every = f"recipes/config/tuned/{config.tuned}.yaml and tuned/{config.algorithm} have every number"
+        every = f"recipes/config/tuned/{config.tuned}.yaml and tuned/{config.algorithm} have all values"
         first = f"settings: tuned={config.tuned}, for {NAMES[config.algorithm]} {said_there[0]}"
         print("\n  ".join((first, *said_there[1:], every)))
         if changed := changed_from_tuned(config):
-            print(f"settings of tuned={config.tuned}, but as asked for: {', '.join(changed)}")
-        print(
-            f"length: {config.total_env_steps:,} env_steps; how long they take here is measured, and said in progress"
-        )
+            print(f"settings that differ from tuned={config.tuned} (its values in brackets): {', '.join(changed)}")
+        print(f"length: {config.total_env_steps:,} env_steps; the progress shows the measured time left")
 
 
 def head_of(file: Path) -> list[str]:
@@ -188,7 +186,9 @@ def shorten_windows(config: DictConfig, device: torch.device) -> None:
     if shortened:
         config.model.batch_length = SHORT_WINDOW
         config.model.batch_size = numbers.batch_size * numbers.batch_length // SHORT_WINDOW
-        print(f"batch: {config.model.batch_size} windows of {SHORT_WINDOW} records that begin warm, on a CUDA device")
+        print(
+            f"batch: {config.model.batch_size} windows of {SHORT_WINDOW} records that start from stored latents (CUDA)"
+        )
     if config.replay.context is None:
         config.replay.context = shortened
 
@@ -196,12 +196,12 @@ def shorten_windows(config: DictConfig, device: torch.device) -> None:
 def disable_drift_loss(config: DictConfig) -> None:
     """Turn the policy-drift loss off if the replay stores no latents, or if latents are sampled."""
     reasons = {
-        "records keep no latents (replay.context=false)": not config.replay.context,
-        "latents are drawn (model.sampled=true)": config.model.sampled,
+        "the replay stores no latents (replay.context=false)": not config.replay.context,
+        "latents are sampled (model.sampled=true)": config.model.sampled,
     }
     if config.loss.drift_scale and any(reasons.values()):
         config.loss.drift_scale = 0.0
-        print(f"policy's drift: not held, because {' and '.join(name for name, holds in reasons.items() if holds)}")
+        print(f"policy drift penalty: off, because {' and '.join(name for name, holds in reasons.items() if holds)}")
 
 
 def can_capture_graph(config: DictConfig, device: torch.device) -> bool:

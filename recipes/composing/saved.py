@@ -47,9 +47,9 @@ def saved_config(run_dir: Path) -> DictConfig:
         config = cast(DictConfig, OmegaConf.merge(OmegaConf.structured(RECIPES[algorithm]), saved))
     except OmegaConfBaseException as error:
         reason = shortened(" ".join(str(error).split()), 300)
-        raise ValueError(f"{path} does not fit: {reason}. The run is of another version: its own reads it.") from error
+        raise ValueError(f"{path} cannot be read: {reason}. Use the version that wrote it.") from error
     if missing := sorted(OmegaConf.missing_keys(config)):
-        raise ValueError(f"{path} is damaged: it does not say {shortened(', '.join(missing))}.")
+        raise ValueError(f"{path} is damaged: it lacks {shortened(', '.join(missing))}.")
     return config
 
 
@@ -70,7 +70,7 @@ def read_yaml(path: Path, kind: type[Config]) -> Config:
         for name, value in flatten(cast(dict[str, Any], OmegaConf.to_container(content, resolve=False))):
             if "${" in str(value):
                 shown = shortened(f"{name}: {value}")
-                raise ValueError(f"{path}: {shown}. A saved configuration says values, it refers to none.")
+                raise ValueError(f"{path}: {shown}. A saved configuration must contain plain values, no references.")
     return content
 
 

@@ -90,7 +90,7 @@ class RunConfig:
     @property
     def run_directory(self) -> RunDirectory:
         """The run's directory, once `resolve_common` has chosen it."""
-        assert self.run_dir is not None, "resolve_common() names it"
+        assert self.run_dir is not None, "resolve_common() sets it"
         return RunDirectory(Path(self.run_dir))
 
     def saved_track(self) -> Track:
@@ -109,9 +109,8 @@ class RunConfig:
         self.logger.check()
         if parallel.asked_for() > 1 and not self.many_processes:
             raise ValueError(
-                f"WORLD_SIZE={parallel.asked_for()}: algorithm={self.algorithm} trains in one process, and of those "
-                "that torchrun starts only recipes/dreamer_v3.py and latent_ppo.py makes use: start it without "
-                "torchrun."
+                f"WORLD_SIZE={parallel.asked_for()}: algorithm={self.algorithm} trains in one process; only "
+                "recipes/dreamer_v3.py and latent_ppo.py support torchrun. Start it without torchrun."
             )
         self.check_worlds()
 
@@ -133,8 +132,8 @@ class RunConfig:
             raise ValueError(f"evaluation.{error}") from error
         if env.start_on_line == 1 and env.start_beyond_gate and not self.schedules_start_on_line:
             raise ValueError(
-                f"env.start_beyond_gate={env.start_beyond_gate:g} is a share of the episodes that do not begin on a "
-                "line, and env.start_on_line=1 leaves none of them: lower that, or leave the other out."
+                f"env.start_beyond_gate={env.start_beyond_gate:g} is a share of the episodes that do not begin on the "
+                "racing line, and env.start_on_line=1 leaves none: lower that, or set env.start_beyond_gate=0."
             )
 
 
@@ -149,7 +148,7 @@ class ReplayRunConfig(RunConfig):
 
     def make_replay_ratio(self) -> ReplayRatio:
         """Make the replay ratio, which counts the updates that are due."""
-        raise NotImplementedError(f"{type(self).__name__} must say how much its run trains.")
+        raise NotImplementedError(f"{type(self).__name__} must implement make_replay_ratio().")
 
     def check(self) -> None:
         """Check as `RunConfig.check`, and refuse settings with which there would be no update."""
@@ -162,9 +161,9 @@ class ReplayRunConfig(RunConfig):
         replay, steps = self.make_replay_ratio(), self.total_env_steps
         if not replay.updates(steps):
             raise ValueError(
-                f"{self.ratio_group}.replay_ratio={replay.ratio} cannot be met: total_env_steps={steps:,} less "
-                f"prefill={self.prefill:,} asks for no whole update of {replay.records} records. "
-                "Raise total_env_steps or the ratio, or lower the prefill."
+                f"{self.ratio_group}.replay_ratio={replay.ratio} is too low: total_env_steps={steps:,} minus "
+                f"prefill={self.prefill:,} gives less than one update of {replay.records} records. Raise "
+                "total_env_steps or the ratio, or lower the prefill."
             )
 
 
@@ -248,7 +247,7 @@ class WorldModelRunConfig(ReplayRunConfig):
             if given:
                 raise ValueError(f"{given[0]} is for collector=ray: add that, or leave it out.")
             return
-        assert workers is not None, "resolve_workers() says how many"
+        assert workers is not None, "resolve_workers() sets it"
         if parallel.asked_for() > 1:
             raise ValueError(
                 f"WORLD_SIZE={parallel.asked_for()} with collector=ray: workers fly for a single learner. Start it "

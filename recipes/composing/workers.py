@@ -43,8 +43,8 @@ def share_of(config: WorldModelRunConfig) -> WorldModelRunConfig:
     check_devices(config)
     if not isinstance(config, LatentPPORunConfig) and config.model.cuda_graph:
         raise ValueError(
-            f"model.cuda_graph=true: {config.algorithm} exchanges imagined returns of {processes} processes "
-            "in the midst of an update. Set it to false, or use recipes/latent_ppo.py, which imagines nothing."
+            f"model.cuda_graph=true: {config.algorithm} exchanges imagined returns between {processes} processes "
+            "during an update. Set it to false, or use recipes/latent_ppo.py, which does not imagine."
         )
     shared = OmegaConf.structured(config)
     for name in DIVIDED + (DIVIDED_PPO if isinstance(config, LatentPPORunConfig) else ()) + ROUNDED_DOWN:
@@ -53,23 +53,22 @@ def share_of(config: WorldModelRunConfig) -> WorldModelRunConfig:
             continue
         if whole % processes and name not in ROUNDED_DOWN:
             raise ValueError(
-                f"{name}={whole} cannot be shared equally by {processes} processes: make it a multiple of "
-                f"{processes}, e.g. {name}={-(-whole // processes) * processes}, or start another number of them "
-                "by --nproc-per-node."
+                f"{name}={whole} cannot be shared equally by {processes} processes: make it a multiple of {processes}, "
+                f"e.g. {name}={-(-whole // processes) * processes}, or change --nproc-per-node."
             )
         OmegaConf.update(shared, name, whole // processes)
     own = cast(WorldModelRunConfig, OmegaConf.to_object(shared))
-    assert config.replay.held_out is not None, "resolve() says"
+    assert config.replay.held_out is not None, "resolve() sets it"
     if config.replay.held_out >= own.env.num_envs:
         raise ValueError(
-            f"replay.held_out={config.replay.held_out} worlds are of the first process, which has {own.env.num_envs} "
-            f"of env.num_envs={config.env.num_envs}: hold out fewer, or raise env.num_envs."
+            f"replay.held_out={config.replay.held_out}: the first process has only {own.env.num_envs} of "
+            f"env.num_envs={config.env.num_envs} worlds: hold out fewer, or raise env.num_envs."
         )
     own.replay.held_out = config.replay.held_out if parallel.is_first() else 0
     own.seed = (config.seed + parallel.rank() * SEEDS_APART) % 2**32
     own.device, own.env.device = (_own_device(device) for device in (config.device, config.env.device))
     print(f"processes: {processes}, each with {own.env.num_envs} worlds and {own.model.batch_size} windows of a batch;")
-    print(f"  process r draws from seed {config.seed} + {SEEDS_APART:,} r")
+    print(f"  process r uses seed {config.seed} + {SEEDS_APART:,} r")
     return own
 
 
@@ -81,8 +80,8 @@ def check_devices(config: WorldModelRunConfig) -> None:
             continue
         if ":" in device:
             raise ValueError(
-                f"{name}={device} would have all {parallel.num_processes()} processes on one device: with {name}=cuda "
-                "each has its own; CUDA_VISIBLE_DEVICES chooses which."
+                f"{name}={device} would put all {parallel.num_processes()} processes on one device: with {name}=cuda "
+                "each gets its own; CUDA_VISIBLE_DEVICES selects them."
             )
         if here > there:
             raise ValueError(
@@ -110,7 +109,7 @@ def resolve_workers(config: DictConfig) -> None:
         left_out = [] if config.num_workers is None else [f"num_workers={config.num_workers}"]
         left_out += [f"workers.{name}={value}" for name, value in config.workers.items() if value != default[name]]
         if left_out:
-            print(f"workers: none (collector={config.collector.value}); left out: {', '.join(left_out)}")
+            print(f"workers: none (collector={config.collector.value}); ignored: {', '.join(left_out)}")
         config.num_workers, config.workers = None, default
 
 
@@ -137,7 +136,7 @@ def make_workers(config: WorldModelRunConfig, env: Environment, policy: DreamerP
     print(
         f"workers: {workers} on Ray (workers.address={asked.address}), each with {own.env.num_envs} worlds on "
         f"{own.env.device}, {asked.cpus:g} CPUs and {asked.gpus:g} GPUs; weights at most {config.weight_interval:,} "
-        "env_steps old; they and their worlds take half a minute to begin",
+        "env_steps old; starting them takes half a minute",
         flush=True,
     )
     with seeded(config.seed):

@@ -105,7 +105,7 @@ def test_where_there_is_no_cluster_the_address_is_named(address: str, monkeypatc
 
     monkeypatch.setattr("ray.is_initialized", lambda: False)
     monkeypatch.setattr("ray.init", refuse)
-    words = rf"workers\.address={address}: no Ray cluster .*\(Could not find .* another\).*workers\.address=local"
+    words = rf"workers\.address={address}: cannot connect .*\(Could not find .* another\).*workers\.address=local"
     with pytest.raises(ValueError, match=words):
         join(address)
 
@@ -115,7 +115,7 @@ def test_where_nobody_answers_ray_does_not_try_for_minutes(monkeypatch: pytest.M
     monkeypatch.setattr("ray.is_initialized", lambda: False)
     with socket.create_server(("127.0.0.1", 0)) as server:  # a port that is nobody's once it is closed
         address = f"127.0.0.1:{server.getsockname()[1]}"
-    with pytest.raises(ValueError, match=rf"workers\.address={address}: no Ray cluster .*refused"):
+    with pytest.raises(ValueError, match=rf"workers\.address={address}: cannot connect .*refused"):
         join(address)
 
 
@@ -144,14 +144,14 @@ def test_what_a_cluster_does_not_have_is_not_waited_for(share: Share, words: str
 def test_a_worker_is_not_spread_over_nodes_or_gpus(share: Share, nodes: list[dict[str, float]], room: int) -> None:
     free = {name: sum(node.get(name, 0.0) for node in nodes) + 9.0 for name in ("CPU", "GPU")}
     check_resources(room, share, nodes, free)
-    with pytest.raises(ValueError, match=rf"there is room for {room} of them on the cluster's {len(nodes)} nodes"):
+    with pytest.raises(ValueError, match=rf"the cluster's {len(nodes)} nodes have room for {room} workers"):
         check_resources(room + 1, share, nodes, free)
 
 
 def test_nodes_of_other_versions_are_refused() -> None:
     here = {"python": "3.11.2", "torch": "2.13.0", "ray": "2.60.0"}
     check_versions("one", here, here)
-    words = r"node two has torch 2\.12\.0 \(here 2\.13\.0\), ray None \(here 2\.60\.0\)\. Install the same there"
+    words = r"node two has torch 2\.12\.0 \(here 2\.13\.0\), ray None \(here 2\.60\.0\)\. Install the same versions"
     with pytest.raises(ValueError, match=words):
         check_versions("two", {"python": "3.11.2", "torch": "2.12.0"}, here)
 
@@ -276,8 +276,8 @@ def of_the_learner_alone() -> None:
 @pytest.mark.parametrize(
     ("make_env", "words"),
     [
-        (of_the_learner_alone, r"node .* cannot have a worker \(ModuleNotFoundError: No module named 'here_alone'\)"),
-        (without_a_renderer, r"node .* cannot have a worker \(RuntimeError: EGL is not there\)"),
+        (of_the_learner_alone, r"node .* cannot run a worker \(ModuleNotFoundError: No module named 'here_alone'\)"),
+        (without_a_renderer, r"node .* cannot run a worker \(RuntimeError: EGL is not there\)"),
     ],
 )
 def test_what_workers_cannot_be_made_of_is_refused_at_once(
@@ -299,7 +299,7 @@ def test_what_workers_cannot_be_made_of_is_refused_at_once(
 @pytest.mark.slow
 @pytest.mark.xdist_group("ray")
 def test_workers_fly_what_a_single_process_would(flown: Flown, monkeypatch: pytest.MonkeyPatch) -> None:
-    """With the same seeds, weights and b₂, bit for bit; a worker that was begun anew, as one with a seed of its own."""
+    """With the same seeds, weights and b₂, bit for bit; a worker that was restarted, as one with a seed of its own."""
     asked, worlds = requests(monkeypatch), N // W
     with torch.random.fork_rng():
         survivor = twin(0)
@@ -390,7 +390,7 @@ def test_who_does_not_answer_is_waited_for_with_patience_and_shortly_by_a_run_th
         rollouts._asked = [never.remote()]
         return rollouts
 
-    with pytest.raises(WorkerError, match=r"Of 1 workers, 0 did not answer .*workers\.patience=1\.5.*num_workers="):
+    with pytest.raises(WorkerError, match=r"Worker 0 of 1 did not answer .*workers\.patience=1\.5.*num_workers="):
         next(waiting())
     monkeypatch.setattr("dreamer_racing.experience.ray_rollouts.STOP_TIMEOUT", 0.5)
     stopped = waiting()

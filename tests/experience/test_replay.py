@@ -389,7 +389,7 @@ def test_what_repeats_takes_little_room(tmp_path):
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        (lambda field: field.pop("frames"), "older version, which did not compress it"),
+        (lambda field: field.pop("frames"), "uncompressed format of an older version"),
         (lambda field: field.update(shape=[2, 2, 3]), "does not hold .* values of torch.uint8"),
         (lambda field: field.update(dtype="torch.int64"), "does not hold .* values of torch.int64"),
         (lambda field: field["frames"].pop(), "does not hold a frame for each of 3 streams"),
@@ -431,7 +431,7 @@ def test_errors_say_what_is_wrong():
     rollout = collect(CountingEnv(3), steps=5, batches=1)[0]
     with pytest.raises(ValueError, match="at least 64"):
         make_replay(10, 1, 6, 64)
-    with pytest.raises(ValueError, match="of 3 environments, the replay was made for 2"):
+    with pytest.raises(ValueError, match="has 3 environments, the replay was made for 2"):
         make_replay(100, 2, 6, 4).extend(rollout)
     with pytest.raises(KeyError, match="InitTracker"):
         records_from_rollout(rollout.exclude("is_init"))

@@ -138,5 +138,5 @@ def test_a_collector_goes_on_from_where_another_was():
 
 
 def test_another_number_of_environments_is_refused_with_the_right_one():
-    with pytest.raises(ValueError, match=r"of 3 environments, this run has 2: set env\.num_envs=3"):
+    with pytest.raises(ValueError, match=r"has 3 environments, this run has 2: set env\.num_envs=3"):
         CollectorState(collector(2, 0.0)).load_state_dict(CollectorState(collector(3, 1.0)).state_dict())

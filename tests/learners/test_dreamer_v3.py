@@ -173,7 +173,7 @@ def test_state_of_another_loss_is_refused(first, second):
     for there, here in ((first, second), (second, first)):
         saved = made_with(there, 1)
         saved.updates = 7
-        assert_refused(saved, made_with(here, 2), r"beyond this learner's, and lacks .* trained with another loss")
+        assert_refused(saved, made_with(here, 2), r"in addition, and lacks .* trained with another loss")
 
 
 @pytest.mark.parametrize(
@@ -385,9 +385,9 @@ def test_what_is_scheduled_reaches_optimiser_and_losses_and_stays():
     assert settings()[:2] == pytest.approx([5e-5, 2e-4])
     learner.adjust(rates=1.0)
     assert settings() == pytest.approx([1e-3, 4e-4, 0.9, 0.1])
-    with pytest.raises(TypeError, match=r"adjust\(discont=...\): a learner of dreamer_v3 has no such number"):
+    with pytest.raises(TypeError, match=r"adjust\(discont=...\): a learner of dreamer_v3 has no such hyperparameter"):
         learner.adjust(discont=0.5)
-    with pytest.raises(ValueError, match=r"world_model_rate=0\.1\) is a share of rates"):
+    with pytest.raises(ValueError, match=r"world_model_rate=0\.1\) is a factor on rates"):
         learner.adjust(world_model_rate=0.1)
 
 
@@ -526,7 +526,7 @@ def made(kind, seed):
 
 @pytest.mark.parametrize(("first", "second"), [("imagined", "latent"), ("latent", "imagined")])
 def test_state_of_another_algorithm_is_refused_before_anything_changes(first, second):
-    assert_refused(made(first, 0), made(second, 1), r"trained by .* begin a run with its weights \(init_from=")
+    assert_refused(made(first, 0), made(second, 1), r"trained with .* start a new run with its weights \(init_from=")
 
 
 def test_state_of_another_critic_is_refused_before_anything_changes():

@@ -177,7 +177,7 @@ def test_an_objective_is_found_by_its_name_or_in_a_module_of_ones_own(tmp_path, 
     assert find_objective("my_objectives:mine") is reinforce
     with pytest.raises(ValueError, match="module 'my_objectives' has no 'missing'"):
         find_objective("my_objectives:missing")
-    with pytest.raises(ValueError, match="'my_objectives:other' is no function of a Trajectory"):
+    with pytest.raises(ValueError, match="'my_objectives:other' is not a function of a Trajectory"):
         find_objective("my_objectives:other")
 
 
@@ -276,9 +276,7 @@ def test_what_an_episode_begins_after_is_not_its_own():
 
 
 def test_records_without_latents_are_refused():
-    with pytest.raises(
-        KeyError, match=r"drift_scale=1 .* no 'context': replay with them \(replay.context=true\), or set"
-    ):
+    with pytest.raises(KeyError, match=r"drift_scale=1 .* no 'context': store latents \(replay.context=true\), or set"):
         make_learner(drift_scale=1.0).update(make_batch())
     assert "loss_drift" not in make_learner().update(make_batch())
 

@@ -327,9 +327,9 @@ def test_targets_are_rows_of_a_table_or_of_ones_own_and_may_be_joined(tmp_path, 
     (tmp_path / "my_targets.py").write_text("from dreamer_racing.losses import State as Mine\nother = 3\n")
     monkeypatch.chdir(tmp_path)
     assert find_targets("reconstruction+my_targets:Mine") == (Image, Vector, State)
-    with pytest.raises(ValueError, match="'my_targets:other' is no subclass of dreamer_racing.losses.Target"):
+    with pytest.raises(ValueError, match="'my_targets:other' is not a subclass of dreamer_racing.losses.Target"):
         find_targets("my_targets:other")
     with pytest.raises(ValueError, match=r"no absent\.py in .*set PYTHONPATH"):
         find_targets("absent:Mine")
-    with pytest.raises(NotImplementedError, match="Target must say what it minimises"):
+    with pytest.raises(NotImplementedError, match="Target must implement forward"):
         Target(Agent(SIZES["debug"], Interface()), LossConfig())(None, None, None, None)

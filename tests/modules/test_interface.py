@@ -74,7 +74,7 @@ def test_interface_of_a_transformed_environment():
 def test_size_of_the_images():
     assert Interface.of(SpecEnv(3, 4, pixels=images(3, 96, 96))) == Interface(image_size=96)
     assert Interface(image_size=96).image_shape == (96, 96, 3)
-    with pytest.raises(ValueError, match="48 × 32 pixels: agents see square ones"):
+    with pytest.raises(ValueError, match="48 × 32 pixels: agents need square images"):
         Interface.of(SpecEnv(3, 4, pixels=images(3, 48, 32)))
 
 
@@ -292,7 +292,7 @@ def test_a_checkpoint_without_an_imu_is_refused_by_networks_with_one() -> None:
     check_layers({name: value for name, value in without.items() if name != "imu"}, without)
     with pytest.raises(ValueError, match="made without env.imu, and this learner's are made with it"):
         check_layers(without, with_one)
-    with pytest.raises(ValueError, match="made with env.imu, and this learner's are not"):
+    with pytest.raises(ValueError, match="made with env.imu, and this learner's are made without it"):
         check_layers(with_one, without)
 
 

@@ -46,7 +46,7 @@ def agent(run_dir: Path) -> Path:
     folder = run_dir.parent / "agents" / "mine"
     command = ("export", f"checkpoint={run_dir}", f"agent={folder}", "commit=abc1234")
     early = recipe(*command, cwd=run_dir.parent)
-    assert early.returncode == 2 and "an agent ships with its numbers. Make it with: " in early.stderr
+    assert early.returncode == 2 and "an agent ships with its results. Make it with: " in early.stderr
     assert "recipes/evaluate.py checkpoint=" in early.stderr
     assert not is_agent(folder)
     of_trained = (f"checkpoint={run_dir}", "weights=trained", *EVALUATION)
@@ -103,7 +103,7 @@ def test_an_agent_is_flown_evaluated_and_exported_as_its_run_is(agent: Path, run
     assert contract["weights_sha256"] == written["provenance"]["weights_sha256"]
     before = {path.name: path.read_bytes() for path in agent.iterdir()}
     done = recipe("export", f"checkpoint={agent}", f"output={agent}/actor.onnx", cwd=tmp_path)
-    assert done.returncode == 2 and "holds an agent, which stays as it is: name another" in done.stderr, done.stderr
+    assert done.returncode == 2 and "holds an agent, which is kept: choose another" in done.stderr, done.stderr
     assert {path.name: path.read_bytes() for path in agent.iterdir()} == before
 
 
@@ -111,7 +111,7 @@ def test_an_agent_is_flown_evaluated_and_exported_as_its_run_is(agent: Path, run
 @pytest.mark.parametrize(
     ("settings", "words"),
     [
-        ({"image_size": 64}, "image_size=64: .*mine was trained with image_size=32, and flies with nothing else"),
+        ({"image_size": 64}, "image_size=64: .*mine was trained with image_size=32, which cannot change"),
         ({"control_rate": 50.0}, "control_rate=50.0: .*mine was trained with control_rate=25.0"),
         ({"camera_tilt": 10.0}, "camera_tilt=10.0: .*mine was trained with camera_tilt=25.0"),
         ({"track": "monza"}, "monza"),

@@ -67,7 +67,7 @@ def test_every_algorithm_has_its_recipe_its_files_and_its_learner(name: str) -> 
 
 def test_an_algorithm_without_a_learner_is_a_defect_that_says_so() -> None:
     config = recipe_module("composing.schema").RunConfig()
-    with pytest.raises(NotImplementedError, match=r"make_learner\(\) knows no learner of a RunConfig"):
+    with pytest.raises(NotImplementedError, match=r"make_learner\(\) has no branch for RunConfig"):
         recipe_module("composing.building").make_learner(config, Interface(), "cpu")
 
 
@@ -208,17 +208,17 @@ def test_what_races_from_images_alone_sees_no_state_in_training() -> None:
     ("override", "reason"),
     [
         ("replay.context=true", None),
-        ("replay.context=false", "records keep no latents (replay.context=false)"),
-        ("model.sampled=true", "latents are drawn (model.sampled=true)"),
+        ("replay.context=false", "the replay stores no latents (replay.context=false)"),
+        ("model.sampled=true", "latents are sampled (model.sampled=true)"),
     ],
 )
-def test_a_policy_is_held_only_at_latents_that_are_kept_as_they_are(
+def test_the_drift_penalty_needs_stored_latents_that_are_not_sampled(
     capsys: pytest.CaptureFixture[str], override: str, reason: str | None
 ) -> None:
     config = recipe_module("dreamer_v3").resolve(compose("dreamer_v3", "tuned=race", override))
     assert config.loss.drift_scale == (1 if reason is None else 0)
-    lines = [line for line in capsys.readouterr().out.splitlines() if line.startswith("policy's drift: ")]
-    assert lines == ([] if reason is None else [f"policy's drift: not held, because {reason}"])
+    lines = [line for line in capsys.readouterr().out.splitlines() if line.startswith("policy drift penalty: ")]
+    assert lines == ([] if reason is None else [f"policy drift penalty: off, because {reason}"])
 
 
 def test_what_races_goes_with_a_state_space_model() -> None:
@@ -260,7 +260,7 @@ def test_what_learns_is_chosen_where_it_does(
 ) -> None:
     assert recipe_module("composing.resolving").tune(compose("dreamer_v3", *overrides, "device=cpu")) == expected
     told = capsys.readouterr().out
-    assert ("settings: tuned=none, the algorithm as published: none are chosen for" in told) == (expected == "none")
+    assert ("tuned=none, the algorithm as published; there are no tuned settings for" in told) == (expected == "none")
 
 
 @pytest.mark.parametrize("algorithm", ["latent_ppo", "dreamer_v3"])
@@ -271,15 +271,15 @@ def test_a_gpu_trains_by_the_settings_that_are_known_and_says_first_what_is_not(
     monkeypatch.setattr(resolving, "choose_device", lambda device: torch.device("cuda" if device == "auto" else device))
     assert resolving.tune(compose(algorithm, "track=kidney", "device=auto")) == "race"
     first, *others = capsys.readouterr().out.splitlines()
-    assert first.startswith("settings: tuned=race, known from CPUs.")
+    assert first.startswith("settings: tuned=race, measured on CPUs.")
     assert "tuned=gpu" in first and "model=size12m" in first and not others
     assert resolving.tune(compose(algorithm, "device=auto", "model=size12m")) == "none"
-    assert "none are chosen for model=size12m" in capsys.readouterr().out
+    assert "no tuned settings for model=size12m" in capsys.readouterr().out
 
 
 def test_a_run_with_a_setting_of_another_version_is_refused_by_its_name(tmp_path: Path) -> None:
     (tmp_path / "config.yaml").write_text("{algorithm: dreamer_v3, model: {size: debug, decay_updates: 8}}")
-    with pytest.raises(ValueError, match=r"does not fit: Key 'decay_updates' .*The run is of another version"):
+    with pytest.raises(ValueError, match=r"cannot be read: Key 'decay_updates' .*Use the version that wrote it"):
         recipe_module("composing.saved").saved_config(tmp_path)
 
 
@@ -338,7 +338,7 @@ def test_what_the_chosen_losses_do_not_have_moves_only_if_it_is_asked_for():
 def test_nothing_goes_by_gates_where_there_are_none():
     overrides = ["env=dmc", "model=debug", "device=cpu", "schedule.discount.to=0.9", "schedule.discount.by=passes"]
     config = OmegaConf.to_object(recipe_module("dreamer_v3").resolve(compose("dreamer_v3", *overrides)))
-    with pytest.raises(ValueError, match=r"schedule.discount.by=passes goes by gates, and env.suite=dmc has none"):
+    with pytest.raises(ValueError, match=r"schedule.discount.by=passes depends on gates, and env.suite=dmc has none"):
         config.check()
 
 
@@ -413,9 +413,9 @@ def test_what_is_not_as_tuned_is_said_of_a_file_that_takes_another(capsys: pytes
     recipe.resolve(compose("latent_ppo", "tuned=images", "device=cpu"))
     told = capsys.readouterr().out
     assert "settings: tuned=images, for latent PPO on Circle from images alone" in told
-    assert "as asked for" not in told and "length: 2,500,000 env_steps" in told
+    assert "settings that differ" not in told and "length: 2,500,000 env_steps" in told
     recipe.resolve(compose("latent_ppo", "tuned=images", "device=cpu", "env.control_rate=50", "loss.image_scale=1"))
-    (line,) = (line for line in capsys.readouterr().out.splitlines() if "as asked for" in line)
+    (line,) = (line for line in capsys.readouterr().out.splitlines() if "settings that differ" in line)
     assert "env.control_rate=50.0 (25.0)" in line and "loss.image_scale=1.0 (0.003)" in line
 
 
@@ -429,10 +429,10 @@ def test_what_is_not_as_tuned_is_said(capsys: pytest.CaptureFixture[str]) -> Non
     """Nothing for the settings as they are; else each with what the file has, also of a group that it takes."""
     recipe = recipe_module("latent_ppo")
     recipe.resolve(compose("latent_ppo", "tuned=race", "track=kidney", "seed=3", "device=cpu"))
-    assert "as asked for" not in capsys.readouterr().out
+    assert "settings that differ" not in capsys.readouterr().out
     changed = ["loss=reconstruction", "loss.critic=latent", "schedule.kl_target.to=null", "replay.context=false"]
     recipe.resolve(compose("latent_ppo", "tuned=race", "device=cpu", "loss.drift_scale=0", *changed))
-    (line,) = (line for line in capsys.readouterr().out.splitlines() if "as asked for" in line)
+    (line,) = (line for line in capsys.readouterr().out.splitlines() if "settings that differ" in line)
     for words in (
         "loss.world_model=reconstruction (privileged)", "loss.critic=latent (state)",
         "schedule.kl_target.to=null (0.004)", "replay.context=false (true)", "loss.drift_scale=0.0 (1.0)",

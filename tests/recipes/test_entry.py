@@ -77,10 +77,10 @@ def test_any_text_can_be_said_to_hydra(text: str) -> None:
         ("xyzzy=1", "xyzzy: there is no such setting of recipes/dreamer_v3.py. docs/options.md has them all."),
         ("model=cpu_smal", "(did you mean cpu_small?)."),
         ("tuned=fast", "tuned=fast: there are auto, gpu, images, none, race, suite."),
-        ("total_env_steps=many", "total_env_steps=many: Value 'many' of type 'str' is no whole number."),
+        ("total_env_steps=many", "total_env_steps=many: Value 'many' of type 'str' is not a whole number."),
         ("env.from_pixels=maybe", "env.from_pixels=maybe: Value 'maybe' is neither true nor false."),
-        ("schedule.discount=0.99", "schedule.discount=0.99: a schedule has an end and times of its own, NAME.to="),
-        ("decoys=paper", "decoys: is added, with a plus: +decoys=..."),
+        ("schedule.discount=0.99", "schedule.discount=0.99: a schedule is set by NAME.to="),
+        ("decoys=paper", "decoys: must be added with a plus: +decoys=..."),
         (
             "schedule.max_std.by=gates",
             "schedule.max_std.by=gates: Invalid value 'gates', expected one of [run, passes, known].",
@@ -115,7 +115,7 @@ def test_what_is_a_setting_is_taken(recipe_name: str, taken: list[str]) -> None:
 @pytest.mark.parametrize(
     ("overrides", "words"),
     [
-        (["env=[[[]]]"], r"env=\[\[\[\]\]\]: a group takes the name"),
+        (["env=[[[]]]"], r"env=\[\[\[\]\]\]: must be the name of one"),
         (["+trak=kidney"], r"trak: there is no such setting .*did you mean track"),
         (["--track", "kidney"], "--track: settings are written without dashes, track=VALUE"),
         (["-m", "--total-env-steps=9"], "--total-env-steps=9: settings are written without dashes, total_env_steps=9"),

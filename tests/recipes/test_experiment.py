@@ -115,7 +115,7 @@ def test_a_finished_run_goes_on_when_more_is_asked_for(tmp_path: Path) -> None:
 
 def test_a_run_with_other_settings_is_not_continued(tmp_path: Path) -> None:
     leave_run(tmp_path / RUN, 1000, OVERRIDES)
-    with pytest.raises(ValueError, match=r"other settings, there and asked for: env\.num_envs: 8 and 16\."):
+    with pytest.raises(ValueError, match=r"other settings \(there, then requested\): env\.num_envs: 8 and 16\."):
         next_command(tmp_path, *CHOSEN[:-1], "env.num_envs=16")
 
 

@@ -194,10 +194,10 @@ def test_what_is_believed_of_a_battery_must_be_what_can_be_reckoned_with():
 @pytest.mark.parametrize(
     ("changes", "words"),
     [
-        ({"readings": 0}, "nothing usable was heard of it; thrust was reckoned by voltage=15.8"),
-        ({}, "15.12 V at the end, by 9 readings"),
-        ({"last_reading_age_s": 3.04}, "15.12 V at the end, by 9 readings, the last one 3.0 s before the end: STALE"),
-        ({"implausible": 2}, "15.12 V at the end, by 9 readings, 2 implausible ones left out"),
+        ({"readings": 0}, "no usable reading; thrust was computed with voltage=15.8"),
+        ({}, "15.12 V at the end, from 9 readings"),
+        ({"last_reading_age_s": 3.04}, "15.12 V at the end, from 9 readings, the last one 3.0 s before the end: STALE"),
+        ({"implausible": 2}, "15.12 V at the end, from 9 readings, 2 implausible ones ignored"),
     ],
 )
 def test_what_was_heard_of_the_battery_is_said(changes, words):
@@ -257,7 +257,7 @@ def test_a_flight_depends_on_no_file_of_its_track(tmp_path, capsys):
     assert hil.replay(hil.HilConfig(replay=str(tmp_path / "run"))) == 0
     path.unlink()
     assert hil.replay(hil.HilConfig(replay=str(tmp_path / "run"))) == 0
-    assert "does not hold its track" not in capsys.readouterr().out
+    assert "does not contain its track" not in capsys.readouterr().out
 
 
 def test_a_flight_of_old_is_not_lifted_when_it_is_played_back(tmp_path):
@@ -309,7 +309,7 @@ def test_a_replay_says_at_which_tick_it_parts(tmp_path, capsys):
     chain.close()
     assert hil.replay(hil.HilConfig(replay=str(tmp_path / "right"))) == 0
     said = capsys.readouterr().out
-    assert "replayed: 5 ticks, every one as it was written" in said and "taken as it is now" in said
+    assert "replayed: 5 ticks, all equal to the recording" in said and "current version of the track" in said
     assert hil.replay(hil.HilConfig(replay=str(tmp_path / "wrong"))) == 1
     assert "tick 3: target_gate was 3, and is 0 now" in capsys.readouterr().err
 

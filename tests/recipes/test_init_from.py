@@ -32,7 +32,7 @@ def test_all_weights_of_a_run_and_nothing_else(trained: Path, capsys: pytest.Cap
     run = prepared(*TINY, *NUMBERS, f"run_dir={trained.parent / 'next'}", f"init_from={trained}", "track=figure8",
                "model.average_rate=0.1")  # fmt: skip
     first = prepared(f"resume={trained}", *TINY, *NUMBERS, f"run_dir={trained}", "seed=7", "model.average_rate=0.1")
-    assert "the averaged ones of" in capsys.readouterr().out
+    assert "weights: averaged, of" in capsys.readouterr().out
     for own, there in ((run.learner.agent, first.learner.agent), (run.learner.averaged, first.learner.averaged)):
         theirs = there.state_dict()
         assert all(torch.equal(value, theirs[name]) for name, value in own.state_dict().items())

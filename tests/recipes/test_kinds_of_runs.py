@@ -65,7 +65,7 @@ def test_a_signal_saves_and_exits_cleanly_and_a_second_one_does_not_save(
     done = run.communicate(timeout=120)
     output = done.stdout + done.stderr
     assert done.returncode == 128 + number, output
-    assert f"{number.name}: saving; again: abandons" in output and "Traceback" not in output
+    assert f"{number.name}: saving; a second signal discards" in output and "Traceback" not in output
     saved = list((tmp_path / "run" / "checkpoints").glob("checkpoint-*"))
     if times == 1:
         assert "of 1,000,000 env_steps" in output and saved
@@ -90,7 +90,7 @@ def test_a_run_outlives_a_full_disk(tmp_path: Path) -> None:
     overrides = ["evaluation.every=100", "checkpoint.every=100", "run_dir=run"]
     done = recipe("dreamer_v3", *TINY, *overrides, cwd=tmp_path, before=UNDRAWN + FULL_DISK.format(times=2))
     assert done.returncode == 0 and done.stdout.count("NOT SAVED") == 2 and "No space left" in done.stdout, done.stderr
-    assert "The run goes on, and tries again" in done.stdout and "GB free" in done.stdout
+    assert "The run continues, and tries again" in done.stdout and "GB free" in done.stdout
     assert latest_checkpoint(tmp_path / "run").name == "checkpoint-000000000224"
 
 
@@ -205,7 +205,7 @@ def test_a_run_without_images(tmp_path: Path) -> None:
     assert len(json.loads((run_dir / "evaluation" / "evaluation.json").read_text())["stochastic"]["episodes"]) == 2
     done = recipe("dreamer_v3", "resume=run", "env.from_pixels=true", "total_env_steps=9000", cwd=tmp_path)
     assert done.returncode == 2 and "Traceback" not in done.stderr, done.stderr
-    assert "environment of other observations" in done.stderr
+    assert "environment with other observations" in done.stderr
 
 
 @pytest.mark.slow

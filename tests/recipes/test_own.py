@@ -140,7 +140,7 @@ def test_what_sees_numbers_of_ones_own_is_not_exported(folder: Path, monkeypatch
     monkeypatch.setattr(exporting, "find_trained", lambda name: folder)
     monkeypatch.setattr(exporting, "config_folder", lambda path: path)
     monkeypatch.setattr(exporting, "trained_config", lambda path: config)
-    with pytest.raises(ValueError, match=r"env\.vector=my_own:action, which computes from the simulator's state"):
+    with pytest.raises(ValueError, match=r"env\.vector=my_own:action, which reads the simulator's state"):
         exporting.export(exporting.ExportConfig(checkpoint="run"))
 
 
@@ -170,10 +170,10 @@ def test_a_run_keeps_the_track_of_a_file_that_is_gone(track: Track, tmp_path: Pa
     write(load_track("circle"), file)
     resumed = recipe("dreamer_v3", "resume=run", "budget=none", "total_env_steps=240", cwd=tmp_path)
     assert resumed.returncode == 0, resumed.stderr
-    assert f"track: as {file} was when the run was begun, which it no longer is\n" in resumed.stdout
+    assert f"track: {file} has changed since the run started; the run keeps the old track\n" in resumed.stdout
     # a choice of settings composes everything anew, up to what is noted
     again = recipe("dreamer_v3", "resume=run", "tuned=auto", *short, "total_env_steps=280", cwd=tmp_path)
-    assert again.returncode == 0 and "which it no longer is" in again.stdout, again.stderr
+    assert again.returncode == 0 and "has changed since" in again.stdout, again.stderr
     of_now = recipe("evaluate", "checkpoint=run", f"track={file}", *EVALUATION, cwd=tmp_path, before=UNDRAWN)
     assert of_now.returncode == 0, of_now.stderr
     export = ("export", f"checkpoint={directory}", "agent=mine", "commit=abc1234")
@@ -206,7 +206,7 @@ def test_the_track_of_a_file_is_noted_when_a_run_begins(track: Track, tmp_path: 
 
 def test_what_a_run_notes_is_not_to_be_given() -> None:
     checks = recipe_module("composing.checks")
-    with pytest.raises(ValueError, match=r"track_description= is what a run notes of its track's file"):
+    with pytest.raises(ValueError, match=r"track_description= is set by the run from its track file"):
         checks.check_overrides(compose("dreamer_v3"), ["track_description={}"])
 
 

@@ -165,7 +165,7 @@ def test_a_port_in_use_is_one_paragraph(tmp_path: Path) -> None:
     [
         (["track=nowhere"], "unknown track 'nowhere'"),
         (["mass=9"], "mass=9.0: must be at least 0.5 and at most 2"),
-        (["betaflight=2026.6", "delay=0.01"], "delay=0.01 is of commands"),
+        (["betaflight=2026.6", "delay=0.01"], "delay=0.01 is for commands"),
         (["actor=circle"], "actor=circle is for firmware="),
         (["firmware=/nowhere", "motor_port=0"], "/nowhere is no program of a Betaflight"),
     ],

@@ -40,17 +40,17 @@ REFUSED = [
     (["collector=ray", "num_workers=3"], ["env.num_envs=32", "num_workers=3", "env.num_envs=33"]),
     (["collector=ray", "workers.weight_interval=500"], ["weight_interval=500", "256 env_steps", "512 env_steps old"]),
     (["collector=ray", "workers.cpus=0"], ["workers.cpus=0", "above 0"]),
-    (["collector=ray", "workers.gpus=1.5"], ["workers.gpus=1.5", "a part of one GPU or whole ones", "workers.gpus=1."]),
+    (["collector=ray", "workers.gpus=1.5"], ["workers.gpus=1.5", "fraction of one GPU", "workers.gpus=1."]),
     (["collector=ray", "num_workers=0"], ["num_workers=0", "at least 1"]),
     (["env.looks=pretty", "env.from_pixels=true"], ["pretty", "nominal", "randomised"]),
     (["env.looks=randomised", "env.from_pixels=false"], ["env.looks=randomised", "nominal"]),
     (["loss.actor=magic"], ["magic", "reinforce"]),
-    (["loss.actor=clipped"], ["loss.actor=clipped learns from collected steps: recipes/latent_ppo.py takes it"]),
+    (["loss.actor=clipped"], ["loss.actor=clipped learns from collected steps: use it with recipes/latent_ppo.py"]),
     (
         ["loss.critic=latent", "loss.actor=reinforce"],
-        ["loss.actor=reinforce learns from imagined steps: recipes/dreamer_v3.py takes it"],
+        ["loss.actor=reinforce learns from imagined steps: use it with recipes/dreamer_v3.py"],
     ),
-    (["loss.actor=flown_ppo"], ["'flown_ppo' is gone", "the algorithm latent_ppo"]),
+    (["loss.actor=flown_ppo"], ["'flown_ppo' was removed", "use recipes/latent_ppo.py"]),
     (["model.replay_ratio=0"], ["model.replay_ratio=0", "above 0"]),
     (["model.replay_ratio=inf"], ["model.replay_ratio=inf", "above 0, and finite"]),
     (["prefill=100", "env.num_envs=8"], ["prefill=100", "12 records", "batch_length=16", "at least 128"]),
@@ -83,23 +83,20 @@ REFUSED = [
     (["env.start_on_line=0.5", "schedule.start_on_line.to=2"], ["schedule.start_on_line.to=2.0: must be at least 0"]),
     (["schedule.discount.begin=0.6", "schedule.discount.end=0.5"], ["schedule.discount: begin=0.6 and end=0.5"]),
     (["schedule.learning_rates.to=0"], ["schedule.learning_rates.to=0.0: must be above 0"]),
-    (["schedule.start_on_line.to=0.3"], ["schedule.start_on_line begins at env.start_on_line=0"]),
-    (
-        ["loss.actor=asymmetric_ppo"],
-        ["'asymmetric_ppo' is gone: it is an algorithm of its own now, recipes/latent_ppo.py loss.critic=state."],
-    ),
+    (["schedule.start_on_line.to=0.3"], ["schedule.start_on_line starts from env.start_on_line=0"]),
+    (["loss.actor=asymmetric_ppo"], ["'asymmetric_ppo' was removed: use recipes/latent_ppo.py loss.critic=state."]),
     (["tuned=images", "env.from_pixels=false"], ["tuned=images is for agents that see images", "leave one out"]),
     (["env=dmc", "loss.critic=state"], ["loss.critic=state: read", "loss.critic=latent"]),
     (["schedule.world_model_rate.to=0"], ["schedule.world_model_rate.to=0.0: must be above 0"]),
     (["schedule.imagination_horizon.to=0"], ["schedule.imagination_horizon.to=0.0: must be at least 1"]),
     (["loss.open_loop_steps=16"], ["loss.open_loop_steps=16", "less than", "model.batch_length=16"]),
     (["loss.ppo.steps=0"], ["loss.ppo.steps=0: must be at least 1"]),
-    (["loss.ppo.kl_target=0.03"], ["loss.ppo.kl_stop=0.03 ends updates before loss.ppo.kl_target=0.03"]),
+    (["loss.ppo.kl_target=0.03"], ["loss.ppo.kl_stop=0.03 must be at least 1.5 times loss.ppo.kl_target=0.03"]),
     (
         ["loss.ppo.kl_target=0.01", "schedule.kl_target.to=0.03"],
-        ["loss.ppo.kl_stop=0.03 ends updates before schedule.kl_target.to=0.03"],
+        ["loss.ppo.kl_stop=0.03 must be at least 1.5 times schedule.kl_target.to=0.03"],
     ),
-    (["schedule.kl_target.to=0.01"], ["schedule.kl_target.to=0.01 begins at loss.ppo.kl_target=null"]),
+    (["schedule.kl_target.to=0.01"], ["schedule.kl_target.to=0.01 starts from loss.ppo.kl_target=null"]),
     (["loss.ppo.kl_target=0.01", "schedule.kl_target.to=0"], ["schedule.kl_target.to=0.0: must be above 0"]),
     (["model.average_rate=5"], ["model.average_rate=5.0: must be above 0 and at most 1"]),
     (["loss.min_std=0.5", "loss.max_std=0.5"], ["loss.min_std=0.5 must be below loss.max_std=0.5"]),
@@ -170,8 +167,8 @@ def test_what_would_be_ignored_is_refused(overrides: list[str], words: str) -> N
         (["env.from_pixels=false", "loss.image_share=0.5"], "is for loss=reconstruction or informed, from images"),
         (["loss=privileged", "loss.barlow_scale=3"], "loss.barlow_scale=3.* is for loss=decoder_free"),
         (["loss.critic=state", "model.imagination_starts=8"], "imagination_starts=8 is for recipes/dreamer_v3.py, whi"),
-        (["loss.drift_scale=1", "replay.context=true"], "drift_scale=1.* is for .*, as they are, model.sampled=false"),
-        (["loss.drift_scale=1", "model.sampled=false"], "drift_scale=1.* is for records that keep latents, replay.con"),
+        (["loss.drift_scale=1", "replay.context=true"], "drift_scale=1.* is for stored latents .*model.sampled=false"),
+        (["loss.drift_scale=1", "model.sampled=false"], "drift_scale=1.* is for stored latents .replay.context=true"),
         (["replay.recent_records=9"], "replay.recent_records=9 is for replay.recent_share above 0"),
         (["replay.storage=memmap", "replay.device=cpu"], "replay.device=cpu is for replay.storage=tensor"),
         (["schedule.wait_every=9"], "wait_every=9 is for schedule.wait_for_model, which is not chosen"),
@@ -265,8 +262,8 @@ def test_an_unknown_protocol_is_refused() -> None:
 
 
 @pytest.mark.parametrize("name", ["circle", str(ROOT / "agents" / "circle")])
-def test_an_agent_is_begun_with_not_resumed(name: str) -> None:
-    words = f"resume={name} is an agent, which no run goes on from: begin one with init_from={name}."
+def test_an_agent_cannot_be_resumed(name: str) -> None:
+    words = f"resume={name} is an agent, not a run to resume: start one with init_from={name}."
     with pytest.raises(ValueError, match=re.escape(words)):
         recipe_module("composing.launching").resumed_config("dreamer_v3", name, [])
 

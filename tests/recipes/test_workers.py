@@ -73,7 +73,7 @@ def test_a_run_outlives_a_worker_and_goes_on_with_workers_or_without(
 
     done = recipe("latent_ppo", f"resume={tmp_path}", "collector=local", "total_env_steps=480", cwd=tmp_path.parent)
     assert done.returncode == 0, done.stderr
-    assert "workers: none (collector=local); left out: num_workers=1, workers.patience=120.0\n" in done.stdout
+    assert "workers: none (collector=local); ignored: num_workers=1, workers.patience=120.0\n" in done.stdout
     assert "collector=local (was ray)" in done.stdout
     assert f"at 416 env_steps, {session.counters['updates']:,} updates" in done.stdout, "all that was learned"
     assert latest_checkpoint(tmp_path).name.endswith("480")
@@ -183,9 +183,9 @@ def test_replays_of_all_processes_must_fit_together(monkeypatch: pytest.MonkeyPa
         (["model.batch_size=5"], 2, ["model.batch_size=5", "2 processes", "model.batch_size=6"]),
         ([], 3, ["env.num_envs=4", "3 processes", "env.num_envs=6", "--nproc-per-node"]),
         (["loss.ppo.minibatch=63"], 2, ["loss.ppo.minibatch=63", "loss.ppo.minibatch=64"]),
-        (["replay.held_out=2"], 2, ["replay.held_out=2", "has 2 of env.num_envs=4"]),
+        (["replay.held_out=2"], 2, ["replay.held_out=2", "has only 2 of env.num_envs=4"]),
         (["device=cuda"], 2, ["device=cuda", "each of the 2 processes", "has 1", "--nproc-per-node=1"]),
-        (["device=cuda:1"], 2, ["device=cuda:1", "device=cuda each has its own"]),
+        (["device=cuda:1"], 2, ["device=cuda:1", "device=cuda each gets its own"]),
         (["model.cuda_graph=true"], 2, ["model.cuda_graph=true", "dreamer_v3 exchanges", "recipes/latent_ppo.py"]),
     ],
     ids=lambda value: ",".join(value) if isinstance(value, list) else None,

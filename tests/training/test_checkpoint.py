@@ -401,7 +401,7 @@ def test_every_damaged_file_is_noticed_and_the_checkpoint_before_it_is_taken(sav
             with caplog.at_level("WARNING"):
                 assert newest_sound(saved) == before, name
             if name != "manifest.json":  # without it there is no checkpoint, which is passed over as such
-                assert f"{newest} is damaged: {name}" in caplog.text and "what came after it is lost" in caplog.text
+                assert f"{newest} is damaged: {name}" in caplog.text and "later training is lost" in caplog.text
             (newest / name).write_bytes(whole)
     assert newest_sound(saved) == newest
 
@@ -420,7 +420,9 @@ def test_a_run_goes_on_from_before_a_damaged_checkpoint_and_replaces_it(saved):
 def test_a_damaged_checkpoint_asked_for_is_refused_by_name(saved):
     newest = saved / "checkpoints/checkpoint-000000000030"
     flip(next(newest.rglob("*-learner/*.pt")))
-    with pytest.raises(RunCheckpointError, match=r"30 is damaged: .*-learner/.*\.pt is not .* checkpoint-000000000020"):
+    with pytest.raises(
+        RunCheckpointError, match=r"30 is damaged: .*-learner/.*\.pt does not match .* checkpoint-000000000020"
+    ):
         Run(saved).checkpoints.load(newest)
     assert load_components(newest, {"counters": {}})["env_steps"] == 30  # what is read of it is sound
 
@@ -481,7 +483,7 @@ def test_a_malicious_state_is_refused_and_nothing_of_it_is_run(saved):
     torch.save({"weight": Payload(witness)}, file)
     write_checksums(newest)  # whoever can write a file can write its sum
     for read in (Run(saved).checkpoints.load, lambda: load_state(newest, "learner")):
-        with pytest.raises(RunCheckpointError, match="could not be restored. A file of it holds what is no state"):
+        with pytest.raises(RunCheckpointError, match="restored. One of its files does not contain a saved state"):
             read()
     assert not witness.exists()
     torch.load(file, weights_only=False)  # as nothing of ours does

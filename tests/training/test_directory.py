@@ -118,7 +118,7 @@ def test_a_file_is_as_it_was_or_as_it_is_to_be(call: str, tmp_path: Path, monkey
 
 def test_the_best_of_a_run_before_there_is_one_says_what_to_do(tmp_path: Path) -> None:
     RunDirectory(tmp_path).config.touch()
-    with pytest.raises(FileNotFoundError, match=rf"first evaluation makes it.* or give {re.escape(str(tmp_path))} for"):
+    with pytest.raises(FileNotFoundError, match=rf"evaluation writes it.* or give {re.escape(str(tmp_path))} for"):
         complete_checkpoints(tmp_path / "best")
     with pytest.raises(FileNotFoundError, match="does not exist"):
         complete_checkpoints(tmp_path / "better")

@@ -55,7 +55,7 @@ def test_a_damaged_number_of_env_steps_costs_its_row_alone_and_is_said(tmp_path,
     path.write_text(path.read_text(encoding="utf-8").replace("20,20", f"{cell},20"), encoding="utf-8")
     with caplog.at_level("WARNING"), MetricsLog(tmp_path, resume_env_steps=30):
         pass
-    assert f"{path} is damaged: " in caplog.text and "1 of 3 rows are left out" in caplog.text
+    assert f"{path} is damaged: " in caplog.text and "1 of 3 rows are ignored" in caplog.text
     assert [row["env_steps"] for row in read(tmp_path)] == ["10", "30"]
 
 

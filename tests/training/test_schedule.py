@@ -36,7 +36,7 @@ def test_a_ramp_without_length_is_a_step():
 
 @pytest.mark.parametrize(("begin", "end"), [(0.6, 0.5), (-0.1, 0.5), (0.5, 1.1)])
 def test_a_ramp_that_ends_before_it_begins_or_outside_the_run_is_refused(begin, end):
-    with pytest.raises(ValueError, match=f"schedule.discount: begin={begin} and end={end} are shares"):
+    with pytest.raises(ValueError, match=f"schedule.discount: begin={begin} and end={end} must satisfy"):
         Ramp(to=0.5, begin=begin, end=end).check("schedule.discount")
 
 
@@ -244,4 +244,4 @@ def test_it_is_measured_once_a_period_and_tells_when_the_actor_waits(caplog: pyt
             measure(lag, ratio)
     assert len(caplog.messages) == 2
     assert caplog.messages[0].startswith("the actor waits: ") and caplog.messages[0].endswith("(wait_for_model=2)")
-    assert caplog.messages[1].startswith("the actor goes on: ")
+    assert caplog.messages[1].startswith("the actor continues: ")
