@@ -14,7 +14,7 @@ from torchrl.objectives.value import GAE
 from dreamer_racing.envs import DroneRacingEnv
 
 parser = argparse.ArgumentParser()
-parser.add_argument("--rollouts", type=int, default=4000, help="of 1024 steps: 64 drones, 16 steps each")
+parser.add_argument("--rollouts", type=int, default=4000, help="rollouts of 1024 steps: 64 drones, 16 steps each")
 arguments = parser.parse_args()
 torch.manual_seed(0)
 

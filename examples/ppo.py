@@ -21,7 +21,7 @@ parser = argparse.ArgumentParser()
 parser.add_argument("--env-steps", type=int, default=1_500_000)
 arguments = parser.parse_args()
 if arguments.env_steps < 1:
-    parser.error(f"--env-steps {arguments.env_steps}: at least 1")
+    parser.error(f"--env-steps {arguments.env_steps}: must be at least 1")
 torch.manual_seed(0)
 drones, steps, epochs, minibatches = 512, 32, 5, 8
 rollouts = math.ceil(arguments.env_steps / (drones * steps))

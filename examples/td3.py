@@ -14,8 +14,8 @@ from torchrl.objectives import SoftUpdate, TD3Loss
 from dreamer_racing.envs import DroneRacingEnv
 
 parser = argparse.ArgumentParser()
-parser.add_argument("--rollouts", type=int, default=1000, help="of 512 steps: 64 drones, 8 steps each")
-parser.add_argument("--random-rollouts", type=int, default=20, help="that come first, before any update")
+parser.add_argument("--rollouts", type=int, default=1000, help="rollouts of 512 steps: 64 drones, 8 steps each")
+parser.add_argument("--random-rollouts", type=int, default=20, help="random ones before the first update")
 arguments = parser.parse_args()
 torch.manual_seed(0)
 

@@ -69,7 +69,7 @@ def test_a_wheel_holds_what_its_recipes_need(installed: Path, tmp_path: Path) ->
     assert done.stdout.startswith("usage: python -m dreamer_racing fly"), done.stderr
     done = start("fly", "agent=nobody", path=installed, cwd=tmp_path)
     names = ", ".join(sorted(path.parent.name for path in (ROOT / "agents").glob("*/agent.json")))
-    named = f"Agents that ship, to be given by name: {names}"
+    named = f"Included agents, by name: {names}"
     assert done.returncode == 2 and named in done.stderr
 
 

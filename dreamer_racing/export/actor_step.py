@@ -202,19 +202,19 @@ def make_step(agent: Agent, latent: str) -> ActorStep:
         ValueError: Unknown latent mode, or an agent that cannot be exported.
     """
     if latent not in LATENTS:
-        raise ValueError(f"latent={latent}: there are {' and '.join(LATENTS)}.")
+        raise ValueError(f"latent={latent}: must be {' or '.join(LATENTS)}.")
     if latent == "sample" and not agent.world_model.rssm.sampled:
         raise ValueError(
-            "latent=sample: this agent's states are the probabilities of their categoricals, of which nothing is drawn "
+            "latent=sample: this agent uses the probabilities of its categorical latents and never samples them "
             "(model.sampled=false): export it with latent=mode."
         )
     seen = agent.interface.observation_keys
     if seen not in ([PIXELS], [VECTOR], [PIXELS, IMU]):
-        raise ValueError(f"This agent sees {' and '.join(seen)}; beside images only an IMU's numbers can be exported.")
+        raise ValueError(f"This agent observes {' and '.join(seen)}; besides images, only an IMU can be exported.")
     if seen == [VECTOR] and agent.interface.vector_dim != RACE_VECTOR_SIZE:
         raise ValueError(
-            f"This agent sees {agent.interface.vector_dim} numbers of its own; only the {RACE_VECTOR_SIZE} of a race "
-            "can be exported."
+            f"This agent observes a custom vector of {agent.interface.vector_dim} numbers; only the race's "
+            f"{RACE_VECTOR_SIZE} numbers can be exported."
         )
     return LATENTS[latent](agent)
 
@@ -246,7 +246,7 @@ def check_output(output: str | Path) -> Path:
     contract = output.parent / CONTRACT
     if contract.exists() and _described(contract).get("onnx") != output.name:
         raise ValueError(
-            f"output={output}: {contract} describes another actor. Every actor has a folder of its own: choose another "
+            f"output={output}: {contract} describes another actor. Every actor needs its own folder: choose another "
             "folder, or remove that export."
         )
     return output

@@ -29,7 +29,7 @@ def existing_agent_path(setting_name: str, name: str) -> Path:
 
 def agents_that_ship() -> str:
     """Return a sentence that names the included agents, for error messages."""
-    return f"Agents that ship, to be given by name: {', '.join(agents_in(AGENTS)) or 'none'}."
+    return f"Included agents, by name: {', '.join(agents_in(AGENTS)) or 'none'}."
 
 
 def agents_in(folder: Path) -> list[str]:

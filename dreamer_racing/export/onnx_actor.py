@@ -130,7 +130,7 @@ class RecurrentActor:
         if self.needs_imu:
             feed["imu"] = self._checked("imu", imu, np.dtype(np.float32))
         elif imu is not None:
-            raise ValueError("imu: this actor has none, by its contract.")
+            raise ValueError("imu: by its contract, this actor takes none.")
         if self.noise_shape is not None:
             noise = self._random.random(self.noise_shape, np.float32) if noise is None else noise
             feed["noise"] = self._checked("noise", noise, np.dtype(np.float32))
@@ -287,7 +287,7 @@ def read_contract(path: str | Path) -> dict[str, Any]:
     if path.is_dir() or path.suffix == ".onnx":
         path = (path if path.is_dir() else path.parent) / CONTRACT
     elif path.suffix != ".json":
-        raise ValueError(f"{path} is no actor: give an .onnx file, or the folder of one.")
+        raise ValueError(f"{path} is not an actor: give an .onnx file, or the folder of one.")
     if not path.is_file():
         raise FileNotFoundError(f"There is no {path}: it belongs beside the .onnx file, from the same export.")
     try:
@@ -321,12 +321,12 @@ def _unlike(value: Any, layout: Any, name: str) -> str:
         parts = [(value[key], inner, f"{name}.{key}".lstrip(".")) for key, inner in wanted.items()]
     elif isinstance(layout, list):
         if not isinstance(value, list) or not value:
-            return f"{name} is {_short(value)}, not a list of something"
+            return f"{name} is {_short(value)}, not a list with entries"
         parts = [(entry, layout[0], f"{name}[{index}]") for index, entry in enumerate(value)]
     else:
         fits = isinstance(value, (int, float) if layout is float else layout) and not isinstance(value, bool)
         if not fits or (layout is float and not abs(value) < 1e9):
-            kinds = {float: "a number", int: "a whole number", str: "a text"}
+            kinds = {float: "a number", int: "a whole number", str: "a string"}
             return f"{name} is {_short(value)}, not {kinds[layout]}"
         return ""
     return next(filter(None, (_unlike(*part) for part in parts)), "")
@@ -338,7 +338,7 @@ def _unfit(contract: dict[str, Any]) -> str:
     if absent := [name for name in (*RECURRENT, "is_init") if name not in names]:
         return f"inputs lacks {', '.join(absent)}"
     if len(parts := contract["files"].keys() & PARTS.keys()) == 1:
-        return f"files has {next(iter(parts))} alone of {' and '.join(PARTS)}"
+        return f"files has only {next(iter(parts))} of {' and '.join(PARTS)}"
     if len(set(names)) < len(names):
         return "inputs has a name twice"
     for name, shape, kind in ((entry["name"], entry["shape"], entry["type"]) for entry in contract["inputs"]):
@@ -348,7 +348,7 @@ def _unfit(contract: dict[str, Any]) -> str:
             return f"the input {_short(name)} has the shape {_short(shape)}"
     actions = contract["inputs"][names.index("previous_action")]["shape"][-1]
     if (channels := len(contract["action"]["channels"])) != actions:
-        return f"action.channels has {channels} entries, of an actor with {actions} actions"
+        return f"action.channels has {channels} entries, but the actor has {actions} actions"
     rate = contract["control"]["rate_hz"]
     return "" if rate > 0 else f"control.rate_hz is {rate}, not above 0"
 
@@ -428,7 +428,7 @@ def main() -> None:
     logger.info("onnxruntime, %d steps, %d thread(s): %s", arguments.steps, arguments.threads,
                 measure_latency(step, seen))  # fmt: skip
     if actor.in_parts:
-        logger.info("of it from seeing to acting: %s", measure_latency(step, seen, actor.prepare))
+        logger.info("of which from observation to action: %s", measure_latency(step, seen, actor.prepare))
 
 
 if __name__ == "__main__":

@@ -152,7 +152,7 @@ def check_parity(actors: Mapping[str, RecurrentActor], flight: RecordedFlight, s
     except ParityError as error:
         if noise is None:
             raise
-        hint = "A sample may also fall where two classes are equal to within rounding: try another seed."
+        hint = "Rounding may also change a sample on the border of two classes: try another seed."
         raise ParityError(f"{error} {hint}") from None
 
 
@@ -184,7 +184,7 @@ def _compare(
         for latent in np.flatnonzero(off[step])[:3]
     )
     raise ParityError(
-        f"{name} does not fly as {original} does: at step {step} of {len(bad)} the action deviates by "
+        f"{name} does not match {original}: at step {step} of {len(bad)} the action deviates by "
         f"{deviation[step]:.2e} (allowed: {ACTION_TOLERANCE:.0e}){', ' + latents if latents else ''}; "
         f"{int(bad.sum())} steps are affected, the largest deviation is {deviation.max():.2e}. Nothing was written."
     )

@@ -57,7 +57,7 @@ def choose_weights(wanted: str, kept: str | tuple[str, ...], source: str | Path)
     """
     kept = (kept,) if isinstance(kept, str) else kept
     if wanted not in CHOICES:
-        raise ValueError(f"weights={wanted}: there are {', '.join(CHOICES)}.")
+        raise ValueError(f"weights={wanted}: must be one of {', '.join(CHOICES)}.")
     if wanted == "auto":
         return AVERAGED if AVERAGED in kept else TRAINED
     if wanted not in kept:
@@ -209,7 +209,7 @@ def check_env(folder: str | Path, contract: dict[str, Any], env: DroneRacingEnv)
         "env.control_rate": (contract["control"]["rate_hz"], 1.0 / env.worlds.parameters.control_dt),
         "env.from_pixels": (camera is not None, env.from_pixels),
         "env.imu": ("exact" if "imu" in contract else "none", "exact" if env.worlds.imu is not None else "none"),
-        "env.vector": ("none", "none" if env.worlds.custom_vector is None else "of your own"),
+        "env.vector": ("none", "none" if env.worlds.custom_vector is None else "a custom one"),
     }
     if camera is not None and env.from_pixels:
         here = describe_camera(env.worlds.camera)
@@ -219,8 +219,7 @@ def check_env(folder: str | Path, contract: dict[str, Any], env: DroneRacingEnv)
         if not (math.isclose(trained, given, rel_tol=1e-6, abs_tol=1e-9) if numbers else trained == given):
             setting = _SETTINGS.get(name, name)
             raise ValueError(
-                f"{setting}={given}: the agent {folder} was trained with {setting}={trained}, and flies "
-                "with nothing else."
+                f"{setting}={given}: the agent {folder} was trained with {setting}={trained}, and flies only with that."
             )
 
 

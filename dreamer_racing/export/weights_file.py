@@ -47,7 +47,7 @@ def write_weights(path: str | Path, weights: Mapping[str, Tensor]) -> dict[str, 
     buffers, end = [], 0
     for name, value in sorted(weights.items()):
         if value.dtype != torch.float32:
-            raise ValueError(f"{name} is {value.dtype}: only float32 is written.")
+            raise ValueError(f"{name} is {value.dtype}: only float32 can be written.")
         buffers.append(value.detach().cpu().contiguous().numpy().astype(_NUMPY).tobytes())
         begin, end = end, end + len(buffers[-1])
         header[name] = {"dtype": _TYPE, "shape": list(value.shape), "data_offsets": [begin, end]}
@@ -73,7 +73,7 @@ def read_weights(path: str | Path) -> dict[str, Tensor]:
         entries = {name: entry for name, entry in header.items() if name != "__metadata__"}
         return {name: _tensor(entry, content[first:]) for name, entry in entries.items()}
     except (ValueError, KeyError, AttributeError, TypeError) as error:
-        raise ValueError(f"{path} is no complete safetensors file of float32 weights ({error!r}).") from error
+        raise ValueError(f"{path} is not a complete safetensors file of float32 weights ({error!r}).") from error
 
 
 def _tensor(entry: Mapping[str, Any], data: bytes) -> Tensor:

@@ -34,7 +34,7 @@ class NoseCamera:
 
     def __init__(self, track: Track, camera: Camera, backend: str = "auto") -> None:
         if backend not in ("auto", *GL_LIBRARIES):
-            raise ValueError(f"renderer={backend}: there are auto, {', '.join(GL_LIBRARIES)}.")
+            raise ValueError(f"renderer={backend}: must be one of auto, {', '.join(GL_LIBRARIES)}.")
         model = build_scene(track, QuadrotorParameters(), camera).compile()
         reasons = []
         for candidate in GL_LIBRARIES if backend == "auto" else (backend,):

@@ -164,7 +164,7 @@ class FlightChain:
         self._image: np.ndarray | None = None  # shown to the flyer; None before a flight's first
         self._shown = 0  # ticks for which it has been shown
         drawn = None if camera is None else camera.camera
-        self._mismatch = None if flyer.camera in (None, drawn) else f"it sees by {flyer.camera}, drawn is {drawn}"
+        self._mismatch = None if flyer.camera in (None, drawn) else f"its camera is {flyer.camera}, not {drawn}"
         self._gates_in_all = None if config.laps is None else config.laps * track.num_gates
         self._newest: Pose | None = None
         self._flying = False  # whether the vehicle has been armed and has left the start
@@ -174,8 +174,8 @@ class FlightChain:
         most = min(LIFT_MOST, config.limits.thrust_max / GRAVITY)
         if config.lift and not LIFT_LEAST <= config.lift <= most:
             raise ValueError(
-                f"lift={config.lift:g}: must be {LIFT_LEAST:g} to {LIFT_MOST:g} weights of thrust, within "
-                f"limits.thrust_max={config.limits.thrust_max:g} m/s², or 0: the flyer takes off by itself."
+                f"lift={config.lift:g}: must be {LIFT_LEAST:g} to {LIFT_MOST:g} times the weight, within "
+                f"limits.thrust_max={config.limits.thrust_max:g} m/s², or 0 if the flyer takes off by itself."
             )
 
     def warm_up(self) -> None:
@@ -275,7 +275,7 @@ class FlightChain:
             self._newest_imu = inputs.imu[-1]
         most = self._config.limits.hold_after
         if self._newest_imu is None or inputs.time - self._newest_imu.time > most:
-            return f"it flies by the IMU, and nothing was heard of that for more than {most:g} s"
+            return f"it needs IMU samples, and none has arrived for more than {most:g} s"
         return None if self.safety.armed else check_at_rest(self._newest_imu.sample)
 
     def _begin(self) -> None:

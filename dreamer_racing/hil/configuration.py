@@ -132,32 +132,32 @@ def check(config: HilConfig) -> None:
     wanted = [name for name in ("actor", "replay", "report") if getattr(config, name) is not None]
     if len(wanted) != 1:
         raise ValueError(
-            f"give one of actor=, replay= and report=, not {' and '.join(wanted) or 'none'}: actor=kidney flies the "
-            "agent that ships, actor=pilot track=kidney the scripted pilot."
+            f"give one of actor=, replay= and report=, not {' and '.join(wanted) or 'none'}: actor=kidney flies an "
+            "included agent, actor=pilot track=kidney the scripted pilot."
         )
     for name, there in (("link", LINKS), ("pose", POSE_SOURCES)):
         if (value := getattr(config, name)) is not None and value not in there:
-            raise ValueError(f"{name}={value}: there are {', '.join(there)}.")
+            raise ValueError(f"{name}={value}: must be one of {', '.join(there)}.")
     if config.operator not in ("auto", *OPERATORS):
-        raise ValueError(f"operator={config.operator}: there are auto, {', '.join(OPERATORS)}.")
+        raise ValueError(f"operator={config.operator}: must be one of auto, {', '.join(OPERATORS)}.")
     if config.operator == "timed" and config.link not in SIMULATED:
         raise ValueError(
-            f"operator=timed enables by itself, and link={config.link} may be a real vehicle: use keyboard."
+            f"operator=timed gives the enable by itself, but link={config.link} may be a real vehicle: use keyboard."
         )
     by_itself = config.operator in ("auto", "timed") and config.link in SIMULATED
     if by_itself and not is_this_machine(config.link_host):
         raise ValueError(
-            f"link_host={config.link_host} is another machine, where a real vehicle may be: operator=keyboard or udp."
+            f"link_host={config.link_host} is another machine, maybe a real vehicle: use operator=keyboard or udp."
         )
     remote = operator_of(config) == "keyboard" and is_remote_terminal()
     if config.arm and remote and config.link not in SIMULATED:
         raise ValueError(
-            f"operator=keyboard over ssh: where the network drops, the enable stays and no kill arrives, and link="
-            f"{config.link} may be a real vehicle. Use operator=udp, which lapses, with python -m "
-            "dreamer_racing.hil.operator at the other end, or a terminal of this machine."
+            f"operator=keyboard over ssh: if the network drops, the enable stays on and no kill arrives, and link="
+            f"{config.link} may be a real vehicle. Use operator=udp, whose enable expires, with python -m "
+            "dreamer_racing.hil.operator at the other end, or use a terminal of this machine."
         )
     if config.against and not config.report:
-        raise ValueError(f"against={config.against} is for report=.")
+        raise ValueError(f"against={config.against} is only used with report=.")
     check_read(config)
 
 
@@ -172,19 +172,19 @@ def check_read(config: HilConfig) -> None:
     if config.actor is None:
         mode, read = ("replay", "renderer") if config.replay is not None else ("report", "against")
         if unread := [name for name in given if name not in (mode, read)]:
-            raise ValueError(f"{unread[0]}= is for flights, and {mode}= is of one that was flown: leave it out.")
+            raise ValueError(f"{unread[0]}= is for new flights, and {mode}= reads a recorded one: leave it out.")
     throttle = config.link not in ("simulated", "udp")
     message = config.pose_message or {"ros2": "PoseStamped"}.get(config.pose)
     for names, is_read, reader in (
         (("preset",), config.actor == PILOT, "actor=pilot"),
-        (("renderer",), config.actor not in (PILOT, IDENTIFY), "an actor that sees"),
+        (("renderer",), config.actor not in (PILOT, IDENTIFY), "an actor with a camera"),
         (("force",), config.vehicle is not None or config.link in BETAFLIGHT, "vehicle=, or a link to a Betaflight"),
-        (("vehicle",), config.actor not in (PILOT, IDENTIFY), "an actor that was trained"),
+        (("vehicle",), config.actor not in (PILOT, IDENTIFY), "a trained actor"),
         (("baud",), config.device is not None, "device="),
         (("link_host", "link_port"), config.device is None, "a link over the network, without device="),
         (("serial_port",), config.link == "betaflight_sitl", "link=betaflight_sitl"),
         (("arm_channel",), config.link in ARMING, f"link={', '.join(ARMING)}"),
-        (("mass", "full_thrust", "reference_voltage", "voltage"), throttle, "a link that takes a throttle"),
+        (("mass", "full_thrust", "reference_voltage", "voltage"), throttle, "a link that sends a throttle"),
         (("voltage_tolerance", "voltage_smoothing"), config.link in BATTERY_LINKS, f"link={', '.join(BATTERY_LINKS)}"),
         (("pose_host", "pose_port"), config.pose_device is None and config.pose != "ros2", "poses over the network"),
         (("pose_device",), config.pose == "mavlink", "pose=mavlink"),
@@ -242,17 +242,17 @@ def check_flight(config: HilConfig, contract: dict[str, Any], track: Track) -> l
             )
         if config.arm_channel != FIRST_SWITCH:
             raise ValueError(
-                f"betaflight_dump= is compared with arming by AUX1, arm_channel={FIRST_SWITCH}, and arm_channel="
+                f"betaflight_dump= is only checked for arming by AUX1, arm_channel={FIRST_SWITCH}, not arm_channel="
                 f"{config.arm_channel}: leave one out."
             )
         count = require_dump(Path(config.betaflight_dump), contract, config.link)
-        notes.append(f"flight controller: {count} settings as wanted (betaflight_dump={config.betaflight_dump})")
+        notes.append(f"flight controller: {count} settings as required (betaflight_dump={config.betaflight_dump})")
     elif config.arm and config.link in BETAFLIGHT:
-        notes.append("flight controller: its settings were not compared; betaflight_dump= of a `dump all` does that")
+        notes.append("flight controller: its settings were not checked; for that give betaflight_dump= of a `dump all`")
     if config.link == "msp_override":
         notes.append(
-            "link=msp_override: the pilot arms, hands over, takes back and disarms; a cut, or the end of the flight, "
-            "is throttle low: motors idle until the pilot disarms"
+            "link=msp_override: the pilot arms, hands over control, takes it back and disarms; a cut, or the end of "
+            "the flight, only sets the throttle low: motors idle until the pilot disarms"
         )
     return notes
 
@@ -313,7 +313,7 @@ def link_config(config: HilConfig, contract: dict[str, Any], rate: float) -> Lin
     numbers = {name: getattr(config, name) for name in ("mass", "full_thrust", "reference_voltage", "voltage")}
     missing = [name for name, number in numbers.items() if number is None]
     if missing and config.link not in ("simulated", "udp"):
-        raise ValueError(f"{missing[0]}= is missing: link={config.link} turns thrust into a throttle by it.")
+        raise ValueError(f"{missing[0]}= is missing: link={config.link} needs it to convert thrust to throttle.")
     thrust = None if missing else ThrustMap(**numbers)
     if thrust is not None:
         check_battery(config, thrust)
@@ -352,7 +352,7 @@ def check_battery(config: HilConfig, thrust: ThrustMap) -> None:
             replace(thrust, voltage=voltage)
         except ValueError as error:
             raise ValueError(
-                f"voltage_tolerance={config.voltage_tolerance:g}: with it {voltage:.4g} V would be believed. {error}"
+                f"voltage_tolerance={config.voltage_tolerance:g}: it would accept a reading of {voltage:.4g} V. {error}"
             ) from error
 
 

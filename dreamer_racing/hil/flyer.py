@@ -115,17 +115,17 @@ def check_contract(contract: dict[str, Any], track: Track, rate: float | None = 
     if geometry is not None and geometry != found:
         differing.append(
             f"source.track is {trained!r}, whose gates, start and bounds have the hash {str(geometry)[:12]} "
-            f"(source.track_sha256), and those of track={track.name} have {found[:12]}"
+            f"(source.track_sha256), but those of track={track.name} have {found[:12]}"
         )
     elif geometry is None and trained is not None and Path(str(trained)).stem != track.name:
-        differing.append(f"source.track is {trained!r}, and track={track.name}")
+        differing.append(f"source.track is {trained!r}, but track={track.name}")
     if rate is not None and abs(rate - own_rate) > 1e-6:
-        differing.append(f"control.rate_hz is {own_rate:g}, and rate={rate:g}")
+        differing.append(f"control.rate_hz is {own_rate:g}, but rate={rate:g}")
     image = contract["inputs"][0]
     if (camera := contract.get("camera")) is not None:
         described = [1, camera["height_px"], camera["width_px"], 3]
         if image["shape"] != described:
-            differing.append(f"camera says images of {described}, and the input {image['name']} is {image['shape']}")
+            differing.append(f"camera gives images of {described}, but the input {image['name']} is {image['shape']}")
     if differing:
         raise ValueError(f"The actor's contract does not fit: {'; '.join(differing)}.")
     if geometry is None:
@@ -149,10 +149,10 @@ def check_rate_loop(contract: dict[str, Any], vehicle: str, force: bool) -> str 
     """
     trained, there = _trained_loop(contract), load_preset(vehicle)
     if trained is None:
-        return f"the contract says nothing of a rate loop: it was not compared with vehicle={vehicle}"
+        return f"the contract does not describe a rate loop: it was not compared with vehicle={vehicle}"
     if (misfit := _unlike_loop(trained, there)) is None:
         return None
-    words = f"The actor was trained with {misfit[0]}, and vehicle={vehicle} has {misfit[1]}"
+    words = f"The actor was trained with {misfit[0]}, but vehicle={vehicle} has {misfit[1]}"
     return _refuse_loop(words, f"env=betaflight env.preset={vehicle}", force)
 
 
@@ -173,7 +173,7 @@ def check_flown_by_betaflight(contract: dict[str, Any], link: str, force: bool) 
     trained = _trained_loop(contract)
     if trained is None or trained["kind"] == "betaflight":
         return None
-    words = f"The actor was trained with {_name_loop(trained['kind'])}, and link={link} tells a Betaflight"
+    words = f"The actor was trained with {_name_loop(trained['kind'])}, but link={link} commands a Betaflight"
     return _refuse_loop(words, "env=betaflight", force)
 
 
@@ -191,10 +191,9 @@ def _refuse_loop(words: str, remedy: str, force: bool) -> str:
         ValueError: ``force`` is false.
     """
     if force:
-        return f"{words}; it flies all the same (force=true)"
+        return f"{words}; it flies anyway (force=true)"
     raise ValueError(
-        f"{words}: it would not answer as the actor has learned. Train with {remedy}, or add force=true to fly all the "
-        "same."
+        f"{words}: the vehicle would not respond as in training. Train with {remedy}, or add force=true to fly anyway."
     )
 
 
@@ -217,10 +216,10 @@ def _unlike_loop(trained: dict[str, Any], there: QuadrotorParameters) -> tuple[s
         for index, axis in enumerate(("roll", "pitch", "yaw"))
     ]
     lag = trained["motor_time_constant_s"]
-    rows.append(("motors of", lag, there.motor_time_constant, widths.get("motor_lag", 0.0)))
+    rows.append(("a motor lag of", lag, there.motor_time_constant, widths.get("motor_lag", 0.0)))
     for name, known, other, width in rows:
         if abs(other - known) > (width + TOLERANCE) * known + 1e-9:
-            unit = " s" if name == "motors of" else ""
+            unit = " s" if name == "a motor lag of" else ""
             return f"{name} {known:g}{unit} (± {width:.0%})", f"{name} {other:g}{unit}"
     return None
 
@@ -254,7 +253,7 @@ def check_ranges(contract: dict[str, Any], limits: SafetyLimits, user_limits: Co
             continue
         words = f"limits.{name}={_listed(most)} clips the actor, which asks for up to {_listed(wanted)} {unit}"
         if name not in user_limits:
-            raise ValueError(f"{words}. Set limits.{name}={_listed(wanted)}, or a smaller one if that is meant.")
+            raise ValueError(f"{words}. Set limits.{name}={_listed(wanted)}, or a smaller one if clipping is intended.")
         clipped.append(words)
     return clipped
 

@@ -72,6 +72,6 @@ def check_at_rest(sample: np.ndarray) -> str | None:
     if math.isfinite(force) and abs(force - GRAVITY) <= AT_REST * GRAVITY:
         return None
     return (
-        f"its accelerometer shows {force:.3g} m/s² where it stands, and not {GRAVITY}: is it calibrated, and its "
-        "message of another scale?"
+        f"its accelerometer reads {force:.3g} m/s² at rest, not {GRAVITY}: is it calibrated, or does its message use "
+        "another scale?"
     )

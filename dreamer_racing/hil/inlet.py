@@ -11,9 +11,9 @@ from collections.abc import Iterator
 from typing import Protocol
 
 _REMEDIES = {
-    errno.EACCES: "Ports below 1024 are the system's: choose one above.",
+    errno.EACCES: "Ports below 1024 are reserved for the system: choose a higher one.",
     errno.EPERM: "This user may not listen there: choose a port above 1024.",
-    errno.EADDRNOTAVAIL: "This machine has no such address: 127.0.0.1 is its own, 0.0.0.0 all that it has.",
+    errno.EADDRNOTAVAIL: "This machine has no such address: 127.0.0.1 is this machine only, 0.0.0.0 all its addresses.",
     errno.EADDRINUSE: "Another program uses it: is another flight, or plant, still running?",
 }
 RECEIVED_AT = 35 if sys.platform == "linux" else None  # SO_TIMESTAMPNS, which Python's socket does not name

@@ -210,7 +210,7 @@ class FlightLoop:
         """
         verdict = outputs.verdict
         rejected = self._poses.rejected if Reason.POSE_LOST in verdict.reasons else 0
-        words = "; ".join(verdict.words) + (f"; {rejected} messages were no poses" if rejected else "")
+        words = "; ".join(verdict.words) + (f"; {rejected} messages were not poses" if rejected else "")
         reasons = tuple(reason for reason in verdict.reasons if reason not in OF_THE_ENABLE) or verdict.reasons
         said = *reasons, rejected > 0
         if not verdict.command.armed and said != self._said:
@@ -288,14 +288,14 @@ class FlightLoop:
                 message = {"in": describe_inputs(inputs), "out": describe_outputs(outputs), "took": took, "bytes": sent}
                 self._recorder.tick(inputs.time, message)
         except Exception as error:
-            self._log(logging.ERROR, "the flight goes on, and is not recorded any longer", error=error)
+            self._log(logging.ERROR, "recording failed: the flight continues, but is no longer recorded", error=error)
             self.statistics.unrecorded = True
             self._recorder = None
         try:
             for watch in self._watchers:
                 watch(outputs)
         except Exception as error:
-            self._log(logging.ERROR, "the flight goes on, and is not shown any longer", error=error)
+            self._log(logging.ERROR, "the view failed: the flight continues, but is no longer shown", error=error)
             self._watchers = ()
 
     def _next(self, deadline: float) -> tuple[float, int]:
@@ -327,7 +327,7 @@ class FlightLoop:
                 self._watchdog.send(at_rest())
             except Exception as error:  # whatever failed, the next frame may get through
                 if not failed:
-                    self._log(logging.ERROR, "the link does not take the disarm frame: %s", error)
+                    self._log(logging.ERROR, "the link did not send the disarm frame: %s", error)
                 failed = True
             deadline += 1.0 / DISARM_RATE
             self._clock.sleep_until(deadline)

@@ -105,11 +105,11 @@ class Motion:
         moved, turned = math.dist(pose.position, last.position), pose.degrees_from(last)
         allowed = limits.reach(elapsed)
         if not moved <= allowed:
-            findings[Reason.POSE_JUMP] = f"the pose jumped by {moved:.3g} m (allowed since the last: {allowed:.3g})"
+            findings[Reason.POSE_JUMP] = f"the pose jumped by {moved:.3g} m (allowed since the last one: {allowed:.3g})"
         allowed = math.degrees(limits.turn_rate_max * elapsed) + limits.turn_tolerance_degrees
         if not turned <= allowed:
             findings[Reason.ATTITUDE_JUMP] = (
-                f"the attitude jumped by {turned:.0f}° (allowed since the last: {allowed:.0f})"
+                f"the attitude jumped by {turned:.0f}° (allowed since the last one: {allowed:.0f})"
             )
         return findings
 

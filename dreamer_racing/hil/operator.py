@@ -191,7 +191,7 @@ def send_operator(source: OperatorSource, send: Callable[[bytes], object], sleep
                 send(encode_operator(number, wish))
                 left -= wish.kill
             except OSError as error:  # the network may come back; the enable lapses meanwhile, and a kill is kept
-                word = f"{word}, which is not sent: {error}"
+                word = f"{word}, but it could not be sent: {error}"
             if word != said:
                 logger.info(word)
                 said = word
@@ -204,18 +204,18 @@ def send_operator(source: OperatorSource, send: Callable[[bytes], object], sleep
 def main() -> None:
     """Send the enable, and a kill, of the keyboard here to a flight with operator=udp."""
     parser = argparse.ArgumentParser(prog="python -m dreamer_racing.hil.operator", description=main.__doc__)
-    parser.add_argument("--host", required=True, help="where recipes/hil.py runs, with operator_host= of that machine")
-    parser.add_argument("--port", type=int, default=PORT, help="its operator_port=")
+    parser.add_argument("--host", required=True, help="address of recipes/hil.py; set operator_host= to it there")
+    parser.add_argument("--port", type=int, default=PORT, help="the same as operator_port= there")
     arguments = parser.parse_args()
     logging.basicConfig(level=logging.INFO, format="%(message)s", stream=sys.stdout)
     if is_remote_terminal():
-        parser.exit(2, "This terminal is at the other end of an ssh connection, which may drop: sit at this machine.\n")
+        parser.exit(2, "This terminal uses an ssh connection, which may drop: run this on your own machine.\n")
     try:
         address = socket.gethostbyname(arguments.host), arguments.port
         keyboard = KeyboardOperator()
     except OSError as error:
         parser.exit(2, f"{arguments.host}: {error}\n")
-    logger.info("e: the enable, and again to take it back; any other key: kill. To %s:%d", *address)
+    logger.info("e: give the enable, and again: take it back; any other key: kill. Sends to %s:%d", *address)
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as switch, contextlib.closing(keyboard):
         send_operator(keyboard, lambda data: switch.sendto(data, address), time.sleep)
 

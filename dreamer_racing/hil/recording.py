@@ -80,7 +80,7 @@ class FlightRecorder:
 
     def _fail(self) -> None:
         self._failed = True
-        raise self._worker.error or OSError(f"{self._path}: the disk does not take what is to be written.")
+        raise self._worker.error or OSError(f"{self._path}: the disk has stalled, and some ticks could not be written.")
 
     def close(self) -> None:
         """Finish the file; may be called twice.
@@ -131,10 +131,10 @@ class Flight:
     def __init__(self, path: Path) -> None:
         path = path / FILE if path.is_dir() else path
         if not path.is_file():
-            raise FileNotFoundError(f"There is no flight {path}: give a folder in which recipes/hil.py flew.")
+            raise FileNotFoundError(f"There is no flight {path}: give the run folder of a flight of recipes/hil.py.")
         messages = list(self._read(path))
         if not messages or messages[0][0] != FLIGHT:
-            raise ValueError(f"{path} is no flight of recipes/hil.py: it does not begin with how it was begun.")
+            raise ValueError(f"{path} is not a flight of recipes/hil.py: its first message is not {FLIGHT}.")
         self.about: dict[str, Any] = messages[0][1]
         if (version := self.about.get("format_version")) != FORMAT_VERSION:
             raise ValueError(f"{path}: a flight of version {version!r}; this release reads version {FORMAT_VERSION}.")
@@ -170,10 +170,10 @@ class Flight:
                         self.whole = True
             except (exceptions.EndOfFile, struct.error) as error:
                 if not topics:
-                    raise ValueError(f"{path} is no flight: it ends before it begins.") from error
+                    raise ValueError(f"{path} is not a flight: it ends before its first message.") from error
                 return  # the loop was killed while it flew
             except (exceptions.McapError, ValueError, KeyError) as error:
-                raise ValueError(f"{path} is no flight, or damaged ({type(error).__name__}: {error}).") from error
+                raise ValueError(f"{path} is not a flight, or is damaged ({type(error).__name__}: {error}).") from error
 
 
 def _encode(message: dict[str, Any]) -> bytes:
@@ -188,7 +188,7 @@ def _plain(value: Any) -> Any:
         return value.item()
     if isinstance(value, bytes):
         return value.hex()
-    raise TypeError(f"{type(value).__name__} has no place in a recording.")
+    raise TypeError(f"{type(value).__name__} cannot be written to a recording.")
 
 
 def _import_mcap(module: str) -> Any:

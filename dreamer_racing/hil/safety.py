@@ -276,7 +276,7 @@ class Safety:
             self._delivered_at = self._now
         silent = self._now - self._delivered_at
         if silent > limits.cut_after:
-            findings[Reason.LINK_LOST] = f"the link has taken no command for {silent:.3g} s"
+            findings[Reason.LINK_LOST] = f"the link has accepted no command for {silent:.3g} s"
         if not tick.refusal:
             self._accepted_at = self._now
         elif not self.armed or self._now - max(self._accepted_at, self._armed_at) > limits.refusal_time:
@@ -289,7 +289,7 @@ class Safety:
             return {}
         seen, last = read_pose(tick.pose), self._motion.newest
         if seen is None:
-            return {Reason.NOT_FINITE: "the pose has numbers that are not finite, or an attitude that is none"}
+            return {Reason.NOT_FINITE: "the pose has numbers that are not finite, or an invalid attitude"}
         if seen.time > self._now + self.limits.hold_after or (last is not None and seen.time <= last.time):
             return {}
         age = to_number(tick.pose_age)
@@ -308,7 +308,7 @@ class Safety:
             self._upright_at = self._now
             return findings
         if not is_within(seen.position, limits.fence_low, limits.fence_high):
-            findings[Reason.GEOFENCE] = f"at {_say(seen.position)} m it is outside of the fence"
+            findings[Reason.GEOFENCE] = f"at {_say(seen.position)} m it is outside the fence"
         if seen.speed > limits.speed_max:
             findings[Reason.SPEED] = f"it moves at {seen.speed:.3g} m/s (allowed: {limits.speed_max:g})"
         if seen.tilt_degrees <= limits.tilt_max_degrees:
@@ -333,7 +333,7 @@ class Safety:
             )
         has_left = math.isfinite(self._left_at)
         if now - self._moved_at > limits.still_time if has_left else now - self._armed_at > limits.lift_off_time:
-            findings[Reason.STRANDED] = "it does not move: is it held fast, or lying somewhere?"
+            findings[Reason.STRANDED] = "it does not move: is it stuck, or lying on the ground?"
         return findings
 
     def _check_lift(self, tick: Tick) -> Findings:
@@ -343,11 +343,11 @@ class Safety:
             return {}
         findings: Findings = {}
         if seen is not None and seen.tilt_degrees > TIPPING * limits.start_tilt_degrees:
-            findings[Reason.TILT] = f"it is tilted by {seen.tilt_degrees:.0f}° while it is lifted"
+            findings[Reason.TILT] = f"it is tilted by {seen.tilt_degrees:.0f}° during the lift"
         if self._now - self.sends_from > limits.lift_time:
             findings[Reason.STRANDED] = (
-                f"it was not seen to rise within limits.lift_time={limits.lift_time:g} s: it is held fast, or heavier "
-                "or weaker than believed, or its poses do not follow it"
+                f"no rise was measured within limits.lift_time={limits.lift_time:g} s: it is stuck, or heavier or "
+                "weaker than assumed, or its poses do not follow it"
             )
         return findings
 

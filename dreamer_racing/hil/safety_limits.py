@@ -110,7 +110,7 @@ class SafetyLimits:
         """
         names = {field.name for field in fields(cls)}
         if unknown := sorted(set(changed) - names):
-            raise ValueError(f"limits.{unknown[0]}: there is no such limit; there are {', '.join(sorted(names))}.")
+            raise ValueError(f"limits.{unknown[0]}: no such limit; must be one of {', '.join(sorted(names))}.")
         x, y, z = track.bounds_low
         own: dict[str, Any] = {
             "fence_low": (x, y, z - BELOW_FLOOR),

@@ -138,14 +138,14 @@ class ThrustMap:
         low, high = self._voltage_ends
         if not low <= self.voltage <= high:
             raise ValueError(
-                f"ThrustMap.voltage={self.voltage} V: must be between {low:g} and {high:g} V, half and one and a half "
-                "times reference_voltage. Is one of a cell and the other of the whole battery?"
+                f"ThrustMap.voltage={self.voltage} V: must be between {low:g} and {high:g} V, 0.5 to 1.5 times "
+                "reference_voltage. Is one that of a cell and the other that of the whole battery?"
             )
         if not self.collective_thrust_max > GRAVITY:
             raise ValueError(
-                f"ThrustMap.full_thrust={self.full_thrust} N: must lift mass={self.mass} kg, of "
+                f"ThrustMap.full_thrust={self.full_thrust} N: must lift mass={self.mass} kg, which weighs "
                 f"{GRAVITY * self.mass:.3g} N, but is {self.collective_thrust_max * self.mass:.3g} N at "
-                f"{self.voltage:g} V. Is it that of all motors together?"
+                f"{self.voltage:g} V. Is it the thrust of all motors together?"
             )
 
     @property
@@ -235,8 +235,8 @@ def check_arm_channel(arm_channel: int) -> None:
     """
     if arm_channel not in range(FIRST_SWITCH, CHANNELS):
         raise ValueError(
-            f"arm_channel={arm_channel}: an index of {FIRST_SWITCH} (AUX1) to {CHANNELS - 1} (AUX12); those before are "
-            "the sticks'."
+            f"arm_channel={arm_channel}: must be {FIRST_SWITCH} (AUX1) to {CHANNELS - 1} (AUX12); lower ones are the "
+            "sticks."
         )
 
 

@@ -93,7 +93,7 @@ class LiveView:
             listening.close()
             os.close(descriptor)
         if not host.startswith("127."):
-            logger.warning("view: it listens on %s: everyone who reaches that address sees the flight", host)
+            logger.warning("view: listens on %s: everyone who can reach that address can see the flight", host)
 
     def show(self, outputs: Outputs) -> None:
         """Show the outputs of a tick, without blocking."""
@@ -261,7 +261,7 @@ def described(frame: Frame | None) -> str:
         f"speed     {speed}",
         f"position  {position} m",
         f"turns at  {rates} rad/s about x, y, z",
-        f"took      {numbers['render_ms']:.1f} ms to draw, {numbers['act_ms']:.1f} ms to choose",
+        f"took      {numbers['render_ms']:.1f} ms to render, {numbers['act_ms']:.1f} ms to act",
         *("image     none: the flyer has no camera" for _ in range(numbers["shape"] is None)),
         *numbers["words"],
     ]

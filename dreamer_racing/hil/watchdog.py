@@ -74,6 +74,6 @@ class Watchdog:
         if not self._is_late():
             return
         try:
-            self.error = None if self._link.send(at_rest()) else OSError("the link did not take it")
+            self.error = None if self._link.send(at_rest()) else OSError("the link did not send the disarm frame")
         except Exception as error:  # whatever failed, the next frame may get through
             self.error = error

@@ -233,10 +233,10 @@ def fit(recorded: Recorded, nominal: QuadrotorParameters) -> Fit:
         ValueError: The drone has no `betaflight`, or there is no stretch that was measured throughout.
     """
     if nominal.betaflight is None:
-        raise ValueError("The fit is of a Betaflight's rate loop: begin with preset=betaflight, or a drone made of it.")
+        raise ValueError("The fit needs Betaflight's rate loop: start from preset=betaflight, or one based on it.")
     parts = stretches(recorded, STRETCH, BURN_IN)
     if not parts:
-        raise ValueError(f"No {STRETCH:g} s of this recording were measured without a gap: it says nothing.")
+        raise ValueError(f"No {STRETCH:g} s of this recording are without a gap: nothing can be fitted.")
     priors = torch.tensor([parameter.prior for parameter in PARAMETERS], dtype=torch.float64)
     probes = torch.tensor([parameter.probe for parameter in PARAMETERS], dtype=torch.float64)
     model = Model(nominal, recorded, parts, 1 + len(PARAMETERS))

@@ -76,14 +76,14 @@ class Recorded:
         for index, (axis, seconds) in enumerate(zip(AXES, self.excited_seconds(), strict=True)):
             if seconds < MIN_SECONDS[index]:
                 lacking.append(
-                    f"{axis} was moved for {seconds:g} s, and needs {MIN_SECONDS[index]:g} s in which its commands "
-                    f"vary by {MIN_EXCITATION[index]:g} {UNITS[index]} or more "
-                    f"(over all of it: {asked[:, index].std():.2g})"
+                    f"{axis} was excited for {seconds:g} s, but needs {MIN_SECONDS[index]:g} s in which its commands' "
+                    f"standard deviation is at least {MIN_EXCITATION[index]:g} {UNITS[index]} "
+                    f"(of the whole recording: {asked[:, index].std():.2g})"
                 )
         if lacking:
             raise ValueError(
-                f"{source} is too short or too quiet: {'; '.join(lacking)}. actor=identify of recipes/hil.py flies "
-                "what is needed."
+                f"{source} is too short or too quiet: {'; '.join(lacking)}. actor=identify of recipes/hil.py flies a "
+                "suitable flight."
             )
 
 
@@ -112,7 +112,7 @@ def read_table(path: Path) -> Recorded:
     names = ("t", "thrust_cmd", "wx_cmd", "wy_cmd", "wz_cmd", "wx", "wy", "wz")
     if not rows or (lacking := [name for name in names if name not in rows[0]]):
         raise ValueError(
-            f"{path} lacks {', '.join(lacking if rows else names)}: see `read_table` for what a table has."
+            f"{path} lacks {', '.join(lacking if rows else names)}: see `read_table` for the required columns."
         )
     time, *columns = (np.array([float(row[name]) for row in rows]) for name in names)
     force = np.array([float(row["az"]) for row in rows]) if "az" in rows[0] else np.full(len(rows), np.nan)
@@ -130,7 +130,7 @@ def of_flight(flight: Flight) -> Recorded:
     sent = [(tick["in"]["time"] + tick["took"]["sent"], tick["out"]["command"]) for tick in flight.ticks]
     armed = [(time, command[1:]) for time, command in sent if command[0]]
     if not armed:
-        raise ValueError("This flight was never armed: there is nothing to be read off it.")
+        raise ValueError("This flight was never armed: there is nothing to fit.")
     poses = np.array([packet for tick in flight.ticks for packet in tick["in"]["received"]], float)
     poses = poses[np.unique(poses[:, 2], return_index=True)[1]]  # sorted by timestamp, without duplicates
     latency = float((flight.about.get("config") or {}).get("latency") or 0.0)

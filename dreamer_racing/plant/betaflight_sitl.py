@@ -62,7 +62,7 @@ def convention_of(release: str) -> PacketConvention:
         return CONVENTIONS[release]
     number = re.match(r"(\d+)\.(\d+)", release)
     if number is None:
-        raise ValueError(f"betaflight={release}: a release of the firmware, as 4.6 or 2026.6, or before for any older.")
+        raise ValueError(f"betaflight={release}: must be a firmware release, as 4.6 or 2026.6, or before (any older).")
     return CONVENTIONS["2026.6" if (int(number[1]), int(number[2])) >= (2026, 6) else "before"]
 
 

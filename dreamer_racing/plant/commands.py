@@ -46,7 +46,7 @@ class Failsafe:
             self._cleared = True
         elif not (self._cleared or self._complained):
             self._complained = True
-            logger.warning("plant: armed without having been disarmed: motors stay off until it is disarmed once")
+            logger.warning("plant: armed before any disarmed message: motors stay off until one arrives")
         return armed and self._cleared
 
     def expire(self, time: float) -> bool:
@@ -55,7 +55,7 @@ class Failsafe:
             return False
         self._cleared = self._complained = False
         self.events += 1
-        logger.warning("plant: nothing heard for %.2f s: motors cut until disarmed and armed again", self._timeout)
+        logger.warning("plant: no message for %.2f s: motors are cut until disarmed and armed again", self._timeout)
         return True
 
 

@@ -217,12 +217,12 @@ def check_process(options: ProcessOptions) -> None:
         incoming, outgoing = "motor_port", ["pose_port", "state_port"]
         if options.lock_step or options.speed != 1.0:
             given = getattr(options, name)
-            raise ValueError(f"{name}={given}: it keeps to the wall clock; leave lock_step=false and speed=1.")
+            raise ValueError(f"{name}={given}: it needs the wall clock; leave lock_step=false and speed=1.")
     if options.lock_step and options.speed != 1.0:
-        raise ValueError(f"speed={options.speed}: with lock_step=true there is no clock to be faster than; leave it.")
+        raise ValueError(f"speed={options.speed}: has no effect with lock_step=true, which has no clock; leave it out.")
     for name in outgoing:
         if getattr(options, name) == getattr(options, incoming):
-            raise ValueError(f"{incoming} and {name} are both {getattr(options, name)}: give each its own.")
+            raise ValueError(f"{incoming} and {name} are both {getattr(options, name)}: give each its own port.")
 
 
 def firmware_option(options: ProcessOptions) -> str | None:
@@ -282,7 +282,7 @@ def start_firmware(named: str, options: ProcessOptions, sockets: Sockets, settin
     try:
         given = options.betaflight
         if given is not None and convention_of(given) != convention_of(firmware.release):
-            raise ValueError(f"betaflight={given}: the firmware says that it is {firmware.release}; leave it out.")
+            raise ValueError(f"betaflight={given}: the firmware reports release {firmware.release}; leave it out.")
         firmware.start()
         firmware.wait_for_serial()
     except BaseException:
@@ -290,7 +290,7 @@ def start_firmware(named: str, options: ProcessOptions, sockets: Sockets, settin
         raise
     logger.info("plant: Betaflight %s, set up in an empty folder: %s", firmware.release, program)
     for line, words in firmware.refused.items():
-        logger.info("plant: it does not take %r: %s", line, words)
+        logger.info("plant: the firmware refused %r: %s", line, words)
     return firmware
 
 

@@ -291,7 +291,7 @@ class PlantVehicle:
             self.on_stand = False
             position = torch.from_numpy(self._start[:3]).unsqueeze(0)
             self._race.begin(torch.tensor([True]), position, torch.tensor([0]))
-            logger.info("plant: the stand let go at %.2f s", self.time)
+            logger.info("plant: the stand released it at %.2f s", self.time)
 
     def _support(self) -> None:
         """Keep a released drone that does not carry its weight yet from sinking through the stand."""
@@ -317,5 +317,5 @@ class PlantVehicle:
             words = self.crash.name.lower().replace("_", " ")
             self.crash_description = f"{words} at {self.time:.2f} s" + ("" if self.armed else ", when disarmed")
             logger.info(
-                "plant: crash: %s; it stays there: start the plant again for the next flight", self.crash_description
+                "plant: crash: %s; it stays there: restart the plant for the next flight", self.crash_description
             )

@@ -201,7 +201,7 @@ def test_every_architecture_flies_alike(
 def test_what_flies_otherwise_than_the_policy_did_is_refused(agent: Agent, tmp_path: Path) -> None:
     flight, step = copy.deepcopy(make_flight(agent)), ActorStep(agent)
     flight.actions[150, 0] += 1e-3
-    with pytest.raises(ParityError, match=r"^torch does not fly as the policy does: at step 150 of 200 .* 1 steps are"):
+    with pytest.raises(ParityError, match=r"^torch does not match the policy: at step 150 of 200 .* 1 steps are"):
         export_actor(step, contract_of(step), flight, tmp_path / "actor.onnx")
     assert not list(tmp_path.iterdir())
 
@@ -383,7 +383,7 @@ def test_an_altered_weight_is_refused(
     before = {path.name: path.read_bytes() for path in tmp_path.iterdir()}
     files[kind] = altered / files[kind].name
     monkeypatch.setattr(export, "write_step", copies(**files))
-    with pytest.raises(ParityError, match=rf"^{name} does not fly as torch does: at step \d+ of 200 .* deviates by \d"):
+    with pytest.raises(ParityError, match=rf"^{name} does not match torch: at step \d+ of 200 .* deviates by \d"):
         export_actor(step, contract_of(step), make_flight(agent), output)
     assert {path.name: path.read_bytes() for path in tmp_path.iterdir()} == before, "the earlier export stays"
     with pytest.raises(ParityError):
@@ -602,10 +602,10 @@ def spoil_input(number: int, key: str, value: object):
         (
             spoil("action", {"channels": [{"name": "x", "unit": "m", "offset": 0, "scale": 1}]}),
             ValueError,
-            "1 entries, of",
+            "1 entries, but",
         ),
         (spoil("camera", 0), ValueError, "camera is 0, not an object"),
-        (spoil("weights_sha256", None), ValueError, "weights_sha256 is None, not a text"),
+        (spoil("weights_sha256", None), ValueError, "weights_sha256 is None, not a string"),
         (lambda path: path.write_text("[" * 100_000), ValueError, "not valid JSON"),
     ],
 )
@@ -632,11 +632,11 @@ def test_a_missing_runtime_is_named(exported: Path, monkeypatch: pytest.MonkeyPa
 
 
 def test_bad_arguments_are_refused(agent: Agent, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    with pytest.raises(ValueError, match="latent=median: there are mode and sample"):
+    with pytest.raises(ValueError, match="latent=median: must be mode or sample"):
         make_step(agent, "median")
     with pytest.raises(ValueError, match="pixels and vector"):
         make_step(make_agent(interface=Interface(vector_dim=21)), "mode")
-    with pytest.raises(ValueError, match="sees 5 numbers of its own; only the 21 of a race"):
+    with pytest.raises(ValueError, match="a custom vector of 5 numbers; only the race's 21 numbers"):
         make_step(make_agent(interface=Interface(pixels=False, vector_dim=5)), "mode")
     with pytest.raises(ValueError, match="must end in .onnx"):
         check_output(tmp_path / "actor.pt")
@@ -719,7 +719,7 @@ def test_the_recipe_refuses_a_copy_that_flies_differently(run_dir: Path) -> None
         "export", f"checkpoint='{run_dir}'", f"output='{output}'", "latent=sample", cwd=run_dir.parent, before=altered
     )
     assert done.returncode == 1, done.stderr
-    assert "error: onnxruntime does not fly as torch does: at step" in done.stderr and "Traceback" not in done.stderr
+    assert "error: onnxruntime does not match torch: at step" in done.stderr and "Traceback" not in done.stderr
     assert "try another seed" in done.stderr, "a sample can be bad luck"
     assert not list(output.parent.iterdir())
 

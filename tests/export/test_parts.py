@@ -55,7 +55,7 @@ def test_other_types_are_refused(tmp_path: Path) -> None:
         write_weights(tmp_path / "weights", {"half": torch.zeros(1, dtype=torch.float16)})
     text = b'{"x":{"dtype":"F16","shape":[1],"data_offsets":[0,2]}}'
     (tmp_path / "half").write_bytes(len(text).to_bytes(8, "little") + text + b"00")
-    with pytest.raises(ValueError, match=r"half is no complete safetensors file .*F16"):
+    with pytest.raises(ValueError, match=r"half is not a complete safetensors file .*F16"):
         read_weights(tmp_path / "half")
 
 
@@ -63,7 +63,7 @@ def test_other_types_are_refused(tmp_path: Path) -> None:
 def test_a_file_that_was_cut_off_is_refused(keep: int, tmp_path: Path) -> None:
     write_weights(tmp_path / "weights", WEIGHTS)
     (tmp_path / "weights").write_bytes((tmp_path / "weights").read_bytes()[:keep])
-    with pytest.raises(ValueError, match="weights is no complete safetensors file"):
+    with pytest.raises(ValueError, match="weights is not a complete safetensors file"):
         read_weights(tmp_path / "weights")
 
 
@@ -135,9 +135,9 @@ def test_an_actor_without_one_takes_none() -> None:
     env = DroneRacingEnv("circle", 1, from_pixels=False)
     contract = make_contract(step, env.worlds.parameters, CAMERA)
     assert contract["format_version"] == 1 and "imu" not in contract and "rate_hz" not in contract["camera"]
-    with pytest.raises(ValueError, match="imu: this actor has none"):
+    with pytest.raises(ValueError, match="imu: by its contract, this actor takes none"):
         TorchActor(contract, step).step(np.zeros((32, 32, 3), np.uint8), imu=np.zeros(6, np.float32))
-    with pytest.raises(ValueError, match="sees pixels and vector; beside images only an IMU"):
+    with pytest.raises(ValueError, match="observes pixels and vector; besides images, only an IMU"):
         make_step(Agent(get_size("debug"), Interface(image_size=32, vector_dim=5), decode=False), "mode")
 
 

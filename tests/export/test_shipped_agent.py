@@ -84,7 +84,7 @@ def test_the_choice_of_weights() -> None:
     assert choose_weights("auto", "trained", "x") == "trained"
     with pytest.raises(ValueError, match="^weights=averaged: runs/x holds the trained weights only"):
         choose_weights("averaged", "trained", "runs/x")
-    with pytest.raises(ValueError, match="weights=best: there are auto, averaged, trained"):
+    with pytest.raises(ValueError, match="weights=best: must be one of auto, averaged, trained"):
         choose_weights("best", both, "x")
 
 
@@ -244,7 +244,7 @@ def leave_out(folder: Path) -> None:
 @pytest.mark.parametrize(
     ("spoil", "error", "message"),
     [
-        (cut_off, ValueError, "no complete safetensors file"),
+        (cut_off, ValueError, "not a complete safetensors file"),
         (alter_weight, ValueError, "weights.safetensors holds other weights than .*contract.json"),
         (leave_out, ValueError, "weights.safetensors does not fit (?s:.*)mlp.output.bias"),
         (lambda folder: (folder / "contract.json").unlink(), FileNotFoundError, "lacks contract.json"),

@@ -383,7 +383,7 @@ def test_damage_is_said(tmp_path, flown):
     data = bytearray((flown / FILE).read_bytes())
     data[len(data) // 2 : len(data) // 2 + 4000] = bytes(4000)
     (tmp_path / FILE).write_bytes(data)
-    with pytest.raises(ValueError, match="is no flight, or damaged"):
+    with pytest.raises(ValueError, match="is not a flight, or is damaged"):
         write_report(tmp_path)
 
 

@@ -271,7 +271,7 @@ def test_comments_and_unknown_lines_are_passed_over(contract):
     [
         ("", "no lines"),
         ("Dear pilot,\nset it to 1050.\n", "no lines"),
-        ("# INAV/MATEKF405 7.1.0 Feb 1 2024\nset min_check = 1050\n", "of INAV"),
+        ("# INAV/MATEKF405 7.1.0 Feb 1 2024\nset min_check = 1050\n", "from INAV"),
     ],
 )
 def test_what_is_no_dump_is_refused(contract, text, said):

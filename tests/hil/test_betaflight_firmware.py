@@ -30,12 +30,12 @@ def test_a_firmware_is_found_by_name_then_by_the_variable_then_in_the_package(
 ) -> None:
     monkeypatch.delenv(firmwares.VARIABLE, raising=False)
     monkeypatch.setattr(firmwares.importlib.util, "find_spec", lambda name: None)
-    with pytest.raises(FileNotFoundError, match=r"pip install .*\[sitl\]' compiles a 4.6"):
+    with pytest.raises(FileNotFoundError, match=r"pip install .*\[sitl\]' compiles version 4.6"):
         find_firmware()
     named = program(tmp_path, "true")
     monkeypatch.setenv(firmwares.VARIABLE, str(named))
     assert find_firmware() == named
-    with pytest.raises(FileNotFoundError, match="nowhere is no program of a Betaflight"):
+    with pytest.raises(FileNotFoundError, match="nowhere is not an executable Betaflight"):
         find_firmware(tmp_path / "nowhere")
 
 
@@ -97,7 +97,7 @@ def test_a_status_is_read_and_said_in_words() -> None:
     status = read_status(STATUS_4_6)
     assert status == FlightControllerStatus(modes=0, flags=1 << 2 | 1 << 28, total=29)
     assert status.names == ("RXLOSS", "ARM_SWITCH")
-    assert status.words.startswith("RXLOSS: it hears no valid channels; ARM_SWITCH: ")
+    assert status.words.startswith("RXLOSS: it receives no valid channels; ARM_SWITCH: ")
     armed = read_status(STATUS_4_6[:6] + b"\1\0\0\0" + STATUS_4_6[10:16] + b"\2" + STATUS_4_6[17:])
     assert armed.armed and armed.modes == 1 | 1 << 33  # of which the further bytes tell
     assert FlightControllerStatus(0, 1 << 26, 29).names == ("flag 26",)

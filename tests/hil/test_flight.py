@@ -362,8 +362,8 @@ def test_messages_that_are_no_poses_are_said_where_there_is_none(caplog):
     with caplog.at_level(logging.INFO, "dreamer_racing.hil.loop"):
         ended = plant.fly(chain_of(Hover(), plant), Hover.rate, 1.0)
     said = [record.getMessage() for record in caplog.records if "there is no pose" in record.getMessage()]
-    assert "messages" not in said[0] and said[-1].endswith("; 1 messages were no poses"), said
-    assert ended.endswith(" messages were no poses")
+    assert "messages" not in said[0] and said[-1].endswith("; 1 messages were not poses"), said
+    assert ended.endswith(" messages were not poses")
 
 
 def test_a_disk_that_is_full_does_not_end_a_flight():
@@ -393,7 +393,7 @@ def test_a_link_that_breaks_in_flight_cuts_and_the_flight_ends_as_any_other(capl
 
     plant = Unplugged(CIRCLE)
     chain = chain_of(Hover(), plant)
-    assert plant.fly(chain, Hover.rate, 30.0).startswith("cut: the link has taken no command for 0.1")
+    assert plant.fly(chain, Hover.rate, 30.0).startswith("cut: the link has accepted no command for 0.1")
     assert chain.safety.state is State.CUT
     assert sum("the link fails" in line for line in caplog.messages) == 1
 
@@ -434,7 +434,7 @@ def test_a_link_that_takes_no_command_cuts_and_its_flight_plays_back(tmp_path):
     plant = Clogged(CIRCLE)
     with FlightRecorder(tmp_path / FILE, {}) as recorder:
         ended = plant.fly(chain_of(Hover(), plant), 50.0, 30.0, recorder)
-    assert ended.startswith("cut: the link has taken no command for 0.16 s")
+    assert ended.startswith("cut: the link has accepted no command for 0.16 s")
     again = chain_of(Hover(), plant)
     for tick in Flight(tmp_path).ticks:
         assert describe_outputs(again.tick(read_inputs(tick["in"])))["state"] == tick["out"]["state"]
@@ -606,9 +606,7 @@ def test_a_lift_that_no_pose_shows_ends_low(hidden, thrust, low, high):
     plant = Blind(CIRCLE, thrust=thrust)
     heights = []
     plant.happens = lambda elapsed: heights.append(plant.vehicle.pose().position[2])
-    assert "it was not seen to rise within limits.lift_time=0.9 s" in plant.fly(
-        chain_of(Hover(), plant), Hover.rate, 3.0
-    )
+    assert "no rise was measured within limits.lift_time=0.9 s" in plant.fly(chain_of(Hover(), plant), Hover.rate, 3.0)
     assert low < max(heights) - heights[0] < high
 
 
@@ -625,7 +623,7 @@ def test_a_flyer_that_wants_nothing_usable_is_not_lifted():
 @pytest.mark.parametrize(("lift", "limits"), [(1.05, {}), (-1.0, {}), (1.6, {}), (1.4, {"thrust_max": 13.0})])
 def test_a_lift_that_lifts_nothing_or_is_clipped_is_refused(lift, limits):
     config = ChainConfig(SafetyLimits.of_track(CIRCLE, **limits), lift=lift)
-    with pytest.raises(ValueError, match=rf"lift={lift:g}: must be 1.1 to 1.5 weights.*limits.thrust_max="):
+    with pytest.raises(ValueError, match=rf"lift={lift:g}: must be 1.1 to 1.5 times the weight.*limits.thrust_max="):
         FlightChain(Hover(), CIRCLE, config, None)
 
 
@@ -637,9 +635,7 @@ def test_a_latency_that_is_no_time_is_refused(latency):
 
 def test_what_does_not_lift_off_does_not_spin_for_ever():
     plant = Watched(CIRCLE, mass=1.3, thrust=0.5)
-    assert fly_hovering(plant).startswith(
-        "cut: it was not seen to rise within limits.lift_time=0.9 s: it is held fast, or"
-    )
+    assert fly_hovering(plant).startswith("cut: no rise was measured within limits.lift_time=0.9 s: it is stuck, or")
     assert 1.4 < max(moment for moment, command in plant.sent if command.armed) < 1.6
 
 

@@ -48,10 +48,10 @@ def test_a_contract_that_does_not_fit_is_refused_with_what_differs():
     assert check_contract(contract, kidney, 25.0) is None
     with pytest.raises(
         ValueError,
-        match=r"source.track is 'kidney', whose .*, and .* track=circle .*; control.rate_hz is 25, and rate=50",
+        match=r"source.track is 'kidney', whose .*, but .* track=circle .*; control.rate_hz is 25, but rate=50",
     ):
         check_contract(contract, CIRCLE, 50.0)
-    with pytest.raises(ValueError, match=r"camera says images of \[1, 96, 64, 3\], and the input image_u8 is"):
+    with pytest.raises(ValueError, match=r"camera gives images of \[1, 96, 64, 3\], but the input image_u8 is"):
         check_contract({**contract, "camera": {**contract["camera"], "height_px": 96}}, kidney)
 
 
@@ -62,7 +62,7 @@ def test_a_track_is_known_by_its_gates_not_by_its_name(tmp_path):
     assert check_contract(contract, load_track(file)) is None  # the same, in a file of another name
     file = tmp_path / "circle.yaml"
     file.write_text(built_in.replace("4.0", "4.1"), encoding="utf-8")
-    with pytest.raises(ValueError, match="source.track is 'circle', whose gates, .* and those of track=circle have"):
+    with pytest.raises(ValueError, match="source.track is 'circle', whose gates, .* but those of track=circle have"):
         check_contract(contract, load_track(file))
 
 
@@ -71,7 +71,7 @@ def test_an_older_contract_is_compared_by_name_and_says_so():
     del contract["source"]["track_sha256"]
     note = check_contract(contract, CIRCLE)
     assert note is not None and "no source.track_sha256: circle was compared by its name only" in note
-    with pytest.raises(ValueError, match="source.track is 'circle', and track=kidney"):
+    with pytest.raises(ValueError, match="source.track is 'circle', but track=kidney"):
         check_contract(contract, load_track("kidney"))
 
 
@@ -97,29 +97,29 @@ def trained_with(preset: str, **changed: Any) -> dict[str, Any]:
 
 
 def test_an_actor_of_another_rate_loop_is_refused_with_both_and_flies_if_forced(tmp_path):
-    words = r"trained with a proportional rate loop, and vehicle=betaflight has a Betaflight's rate loop.*force=true"
+    words = r"trained with a proportional rate loop, but vehicle=betaflight has a Betaflight's rate loop.*force=true"
     with pytest.raises(ValueError, match=words):
         check_rate_loop(trained_with("faithful"), "betaflight", force=False)
-    with pytest.raises(ValueError, match="trained with a Betaflight's rate loop, and vehicle=easy has a proportional"):
+    with pytest.raises(ValueError, match="trained with a Betaflight's rate loop, but vehicle=easy has a proportional"):
         check_rate_loop(trained_with("betaflight"), "easy", force=False)
     forced = check_rate_loop(trained_with("faithful"), "betaflight", force=True)
-    assert forced is not None and forced.endswith("it flies all the same (force=true)")
+    assert forced is not None and forced.endswith("it flies anyway (force=true)")
     assert check_rate_loop(trained_with("easy"), "faithful", force=False) is None
     assert check_rate_loop(trained_with("betaflight"), "betaflight", force=False) is None
     old = {"source": {"preset": "easy"}}
     with pytest.raises(ValueError, match="trained with a proportional rate loop"):
         check_rate_loop(old, "betaflight", force=False)
     unknown = check_rate_loop({"source": {"preset": "mine"}}, "betaflight", force=False)
-    assert unknown is not None and "says nothing of a rate loop" in unknown
+    assert unknown is not None and "does not describe a rate loop" in unknown
 
 
 def test_a_link_to_a_betaflight_is_for_actors_of_its_rate_loop():
-    words = r"trained with a proportional rate loop, and link=crsf tells a Betaflight.*env=betaflight.*force=true"
+    words = r"trained with a proportional rate loop, but link=crsf commands a Betaflight.*env=betaflight.*force=true"
     for contract in (trained_with("faithful"), {"source": {"preset": "easy"}}):
         with pytest.raises(ValueError, match=words):
             check_flown_by_betaflight(contract, "crsf", force=False)
     forced = check_flown_by_betaflight(trained_with("easy"), "crsf", force=True)
-    assert forced is not None and forced.endswith("it flies all the same (force=true)")
+    assert forced is not None and forced.endswith("it flies anyway (force=true)")
     for contract in (trained_with("betaflight"), {"source": {"preset": "mine"}}):
         assert check_flown_by_betaflight(contract, "crsf", force=False) is None
 
@@ -128,8 +128,8 @@ def test_a_link_to_a_betaflight_is_for_actors_of_its_rate_loop():
     ("gains", "lag", "words"),
     [
         ((45.0, 47.0 * 1.25, 30.0), 0.03, None),  # within the widths of training, and what is allowed beyond them
-        ((45.0, 47.0 * 1.35, 30.0), 0.03, r"p of pitch 47 \(± 20%\), and vehicle=.* has p of pitch 63.45"),
-        ((45.0, 47.0, 30.0), 0.05, r"motors of 0.03 s \(± 30%\), and vehicle=.* has motors of 0.05 s"),
+        ((45.0, 47.0 * 1.35, 30.0), 0.03, r"p of pitch 47 \(± 20%\), but vehicle=.* has p of pitch 63.45"),
+        ((45.0, 47.0, 30.0), 0.05, r"motor lag of 0.03 s \(± 30%\), but vehicle=.* has a motor lag of 0.05 s"),
     ],
 )
 def test_gains_and_motors_may_differ_as_far_as_those_of_training_did(gains, lag, words, tmp_path):
@@ -252,7 +252,7 @@ def test_armed_without_thrust_is_low_enough_to_arm():
 
 @pytest.mark.parametrize("arm_channel", [-1, 0, 3, 16])
 def test_a_stick_arms_nothing(arm_channel):
-    with pytest.raises(ValueError, match=f"arm_channel={arm_channel}: an index of 4"):
+    with pytest.raises(ValueError, match=f"arm_channel={arm_channel}: must be 4"):
         channels(armed(), RATES, THRUST, arm_channel)
 
 
@@ -336,7 +336,7 @@ def test_a_flight_is_told_what_the_plant_feels_and_plays_back_bit_for_bit(tmp_pa
 def test_without_samples_it_does_not_arm_and_in_flight_it_is_cut() -> None:
     plant, chain = make()
     plant.read_imu = list
-    assert "it flies by the IMU, and nothing was heard of that" in plant.fly(chain, 50.0, 1.0)
+    assert "it needs IMU samples, and none has arrived" in plant.fly(chain, 50.0, 1.0)
     plant, chain = make()
     read_imu = plant.read_imu
     plant.read_imu = lambda: read_imu() if plant.elapsed < 2.0 else []
@@ -348,4 +348,4 @@ def test_an_accelerometer_of_another_scale_is_refused_on_the_ground() -> None:
     plant, chain = make()
     read_imu = plant.plant.vehicle.read_imu
     plant.plant.vehicle.read_imu = lambda: read_imu() * np.array((1.0, 1.0, 1.0, 0.5, 0.5, 0.5))
-    assert "its accelerometer shows 4.91 m/s² where it stands" in plant.fly(chain, 50.0, 1.0)
+    assert "its accelerometer reads 4.91 m/s² at rest" in plant.fly(chain, 50.0, 1.0)

@@ -178,7 +178,7 @@ def test_the_switch_of_a_terminal_is_heard_and_ends_with_a_kill(last, clock, swi
     assert [will.kill for will in heard[2:]] == [True] * KILLS
     said = [record.getMessage() for record in caplog.records]
     assert said[1:] == [
-        "the enable is given, which is not sent: Network is unreachable", "the enable is given", "kill"
+        "the enable is given, but it could not be sent: Network is unreachable", "the enable is given", "kill"
     ]  # fmt: skip
 
 

@@ -146,7 +146,7 @@ def test_a_port_in_use_is_said(poses):
 @pytest.mark.parametrize(
     ("number", "remedy"),
     [
-        (errno.EACCES, "Ports below 1024 are the system's"),
+        (errno.EACCES, "Ports below 1024 are reserved"),
         (errno.EADDRINUSE, "Another program uses it"),
         (errno.EADDRNOTAVAIL, "This machine has no such address"),
         (errno.ENOBUFS, os.strerror(errno.ENOBUFS) + "."),

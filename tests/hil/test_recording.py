@@ -71,7 +71,7 @@ def test_a_disk_that_takes_nothing_for_too_long_ends_the_recording_without_a_gap
                 recorder.tick(0.02 * index, {"index": index})
                 taken.append(index)
 
-        with pytest.raises(OSError, match=r"flight\.mcap: the disk does not take what is to be written"):
+        with pytest.raises(OSError, match=r"flight\.mcap: the disk has stalled"):
             fly()
         released.set()
     flight = Flight(tmp_path)
@@ -110,7 +110,7 @@ def test_a_file_may_end_anywhere(recorded):
 @pytest.mark.parametrize("content", [b"", b"nonsense, and more of it", bytes(range(256)) * 8])
 def test_other_files_are_refused(tmp_path, content):
     (tmp_path / FILE).write_bytes(content)
-    with pytest.raises(ValueError, match="is no flight"):
+    with pytest.raises(ValueError, match="is not a flight"):
         Flight(tmp_path)
 
 
@@ -120,7 +120,7 @@ def test_a_flight_is_never_overwritten(recorded):
 
 
 def test_there_must_be_one(tmp_path):
-    with pytest.raises(FileNotFoundError, match=r"There is no flight .*: give a folder in which recipes/hil.py flew"):
+    with pytest.raises(FileNotFoundError, match=r"There is no flight .*: give the run folder of a flight"):
         Flight(tmp_path / "nowhere")
 
 

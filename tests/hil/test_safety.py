@@ -279,7 +279,7 @@ def test_both_sides_of_what_an_attitude_may_turn_between_two_poses(axis, degrees
     flight = Flight(turn_rate_max=15.0, turn_tolerance_degrees=20.0).flying()
     verdict = flight.tick(pose={"attitude": turned(axis, degrees)})
     assert verdict.state is state and verdict.reasons == (() if state is State.FLYING else (Reason.ATTITUDE_JUMP,))
-    jumped = f"the attitude jumped by {abs(degrees):.0f}° (allowed since the last: 47)"
+    jumped = f"the attitude jumped by {abs(degrees):.0f}° (allowed since the last one: 47)"
     assert state is State.FLYING or verdict.words == (jumped,)
 
 
@@ -510,7 +510,7 @@ def test_a_link_that_takes_no_command_is_cut_when_that_lasts():
     assert flight.ticks(4, command_dropped=True).state is State.FLYING  # 4/32 s, as long as allowed
     verdict = flight.tick(command_dropped=True)
     assert verdict.state is State.CUT and verdict.reasons == (Reason.LINK_LOST,)
-    assert verdict.words == ("the link has taken no command for 0.156 s",)
+    assert verdict.words == ("the link has accepted no command for 0.156 s",)
 
 
 def test_a_link_that_takes_no_command_does_not_arm():
@@ -768,5 +768,5 @@ def test_limits_of_a_track_know_its_box_and_refuse_names_that_are_none():
     assert limits.fence_high == track.bounds_high and limits.fence_low[2] < 0.0
     assert limits.start_position == track.start_position and limits.speed_max == 9.0
     assert limits.rate_max == (5.0, 5.0, 2.0)
-    with pytest.raises(ValueError, match="limits.speed: there is no such limit; there are arm_time"):
+    with pytest.raises(ValueError, match="limits.speed: no such limit; must be one of arm_time"):
         SafetyLimits.of_track(track, speed=9.0)

@@ -73,7 +73,7 @@ def test_state_and_numbers_are_told_in_text(view):
         "position  1.00, 2.00, 3.00 m",
         "turns at  0.0, 0.0, 0.0 rad/s about x, y, z",
     ]
-    assert lines[6] == "took      1.5 ms to draw, 2.5 ms to choose"
+    assert lines[6] == "took      1.5 ms to render, 2.5 ms to act"
 
 
 def test_without_pose_and_camera_it_says_why(view):
@@ -153,7 +153,7 @@ def test_a_port_in_use_is_said(view):
 
 def test_whoever_else_may_see_it_is_said(caplog):
     LiveView(port=0, host="0.0.0.0").close()
-    assert "everyone who reaches that address sees the flight" in caplog.text
+    assert "everyone who can reach that address can see the flight" in caplog.text
 
 
 def test_it_closes_at_once_with_a_browser_at_it(view):

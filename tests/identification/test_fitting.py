@@ -98,10 +98,10 @@ def test_found_numbers_become_a_drone() -> None:
 
 
 def test_other_rate_loops_and_recordings_full_of_gaps_are_refused() -> None:
-    with pytest.raises(ValueError, match="begin with preset=betaflight"):
+    with pytest.raises(ValueError, match="start from preset=betaflight"):
         fit(commands(2), PRESETS["easy"])
     asked = commands(2)
-    with pytest.raises(ValueError, match="measured without a gap"):
+    with pytest.raises(ValueError, match="are without a gap"):
         fit(replace(asked, rates=np.full_like(asked.rates, np.nan)), NOMINAL)
 
 
@@ -153,18 +153,18 @@ def test_a_recording_that_tells_enough_passes() -> None:
 
 
 def test_what_is_too_short_or_too_quiet_says_which_axis_needs_what() -> None:
-    with pytest.raises(ValueError, match=r"this one is too short or too quiet: yaw was moved for 2 s, and needs 3 s"):
+    with pytest.raises(ValueError, match=r"this one is too short or too quiet: yaw was excited for 2 s, but needs 3 s"):
         recorded(2.5).check("this one")
     quiet = recorded(5.0)
     quiet.command[:, 1] = 0.01
     with pytest.raises(
-        ValueError, match=r"quiet: roll was moved for 0 s, and needs 2 s .* vary by 0.4 rad/s"
+        ValueError, match=r"quiet: roll was excited for 0 s, but needs 2 s .* at least 0.4 rad/s"
     ) as raised:
         quiet.check("this one")
     assert "pitch" not in str(raised.value) and "actor=identify" in str(raised.value)
     blind = recorded(5.0)
     blind.rates[:] = np.nan
-    with pytest.raises(ValueError, match="roll was moved for 0 s"):
+    with pytest.raises(ValueError, match="roll was excited for 0 s"):
         blind.check("this one")
 
 

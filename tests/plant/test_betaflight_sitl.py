@@ -175,7 +175,7 @@ def test_silence_of_the_firmware_cuts_the_motors_until_it_has_been_disarmed() ->
 
 
 def test_an_unknown_firmware_is_refused() -> None:
-    with pytest.raises(ValueError, match="betaflight=new: a release of the firmware, as 4.6 or 2026.6, or before"):
+    with pytest.raises(ValueError, match="betaflight=new: must be a firmware release, as 4.6 or 2026.6, or before"):
         BetaflightSitl(PlantVehicle("circle"), lambda data: None, "new")
 
 

@@ -226,13 +226,13 @@ def test_nothing_but_a_command_makes_a_lock_step(fresh: PlantVehicle, incoming: 
     [
         ({"command_port": 9100}, "command_port and pose_port are both 9100"),
         ({"betaflight": "2026.6", "state_port": 9100, "motor_port": 9100}, "motor_port and pose_port are both 9100"),
-        ({"betaflight": "4"}, "betaflight=4: a release of the firmware, as 4.6 or 2026.6"),
-        ({"betaflight": "4.6", "lock_step": True}, "betaflight=4.6: it keeps to the wall clock"),
-        ({"firmware": "auto", "speed": 2.0}, "firmware=auto: it keeps to the wall clock"),
+        ({"betaflight": "4"}, "betaflight=4: must be a firmware release, as 4.6 or 2026.6"),
+        ({"betaflight": "4.6", "lock_step": True}, "betaflight=4.6: it needs the wall clock"),
+        ({"firmware": "auto", "speed": 2.0}, "firmware=auto: it needs the wall clock"),
         ({"firmware": "auto", "state_port": 9002}, "motor_port and state_port are both 9002"),
         ({"betaflight": "before", "lock_step": True}, "wall clock"),
         ({"betaflight": "before", "speed": 2.0}, "wall clock"),
-        ({"lock_step": True, "speed": 2.0}, "no clock to be faster than"),
+        ({"lock_step": True, "speed": 2.0}, "no effect with lock_step=true"),
     ],
 )
 def test_what_excludes_each_other_is_refused(options: dict[str, object], message: str) -> None:

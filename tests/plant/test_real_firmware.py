@@ -151,7 +151,7 @@ def test_what_does_not_arm_says_why(set_up: SetUp) -> None:
     link = ChannelLink(SitlTransport(radio, serial), encode_sitl, RATES, THRUST, telemetry=MspTelemetry())
     step = FirmwareStep(PlantVehicle("circle", "faithful"), firmware, link)
     radio.disconnected = True
-    assert talk(step, at_rest(), 2.0).startswith("RXLOSS: it hears no valid channels")
+    assert talk(step, at_rest(), 2.0).startswith("RXLOSS: it receives no valid channels")
     radio.disconnected = False
     assert talk(step, at_rest(), 2.0) == ""
     assert "THROTTLE: the throttle is not low" in talk(step, asked(), 1.0) and not step.plant.vehicle.armed

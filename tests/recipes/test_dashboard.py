@@ -112,7 +112,7 @@ def test_flights_of_two_tracks_do_not_fit_into_one_scene(runs: Path) -> None:
 @pytest.mark.parametrize(
     ("overrides", "before", "words"),
     [
-        (["run=nowhere"], "", "run=nowhere: there is no such file or folder. Agents that ship, to be given"),
+        (["run=nowhere"], "", "run=nowhere: there is no such file or folder. Included agents, by name"),
         (["run=nowhere"], "import sys; sys.modules['viser'] = None", "needs the package viser: "),
     ],
     ids=["no such run", "no viser"],

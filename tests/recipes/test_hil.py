@@ -23,29 +23,29 @@ hil = recipe_module("hil")
     [
         ({}, "give one of actor=, replay= and report=, not none"),
         ({"actor": "pilot", "report": "x"}, "not actor and report"),
-        ({"actor": "pilot", "operator": "cat"}, "operator=cat: there are auto, keyboard, udp, timed"),
+        ({"actor": "pilot", "operator": "cat"}, "operator=cat: must be one of auto, keyboard, udp, timed"),
         (
             {"actor": "pilot", "link": "crsf", "operator": "timed"},
-            "operator=timed enables by itself, and link=crsf may be",
+            "operator=timed gives the enable by itself, but link=crsf may be",
         ),
         ({"actor": "pilot", "link_host": "10.0.0.5"}, "link_host=10.0.0.5 is another machine"),
         ({"actor": "pilot", "link_host": "127.x.example"}, "link_host=127.x.example is another machine"),
         ({"actor": "pilot", "link_host": "127.0.0.1.example"}, "link_host=127.0.0.1.example is another machine"),
-        ({"actor": "pilot", "against": "x"}, "against=x is for report="),
-        ({"actor": "pilot", "link": "simulatd"}, "link=simulatd: there are "),
-        ({"actor": "pilot", "pose": "foo"}, "pose=foo: there are udp, mavlink, ros2"),
+        ({"actor": "pilot", "against": "x"}, "against=x is only used with report="),
+        ({"actor": "pilot", "link": "simulatd"}, "link=simulatd: must be one of "),
+        ({"actor": "pilot", "pose": "foo"}, "pose=foo: must be one of udp, mavlink, ros2"),
         ({"actor": "pilot", "rate": 3.0}, "rate=3.0: must be at least 10 and at most 500"),
         ({"actor": "pilot", "baud": 9600}, "baud=9600 is for device=, which is not given"),
         ({"actor": "pilot", "pose_device": "/dev/x"}, "pose_device=/dev/x is for pose=mavlink"),
         ({"actor": "pilot", "pose_baud": 9600}, "pose_baud=9600 is for pose_device="),
         ({"actor": "pilot", "pose_topic": "/p"}, "pose_topic=/p is for pose=ros2"),
         ({"actor": "pilot", "pose_message": "ODOMETRY"}, "pose_message=ODOMETRY is for pose=mavlink or ros2"),
-        ({"actor": "pilot", "renderer": "egl"}, "renderer=egl is for an actor that sees"),
+        ({"actor": "pilot", "renderer": "egl"}, "renderer=egl is for an actor with a camera"),
         ({"actor": "kidney", "smoothing": 0.5}, "smoothing=0.5 is for poses without velocities, VISION_"),
         ({"actor": "kidney", "pose": "mavlink", "smoothing": 0.5}, "smoothing=0.5 is for poses without velocities"),
-        ({"report": "x", "renderer": "egl"}, "renderer= is for flights, and report= is of one that was flown"),
+        ({"report": "x", "renderer": "egl"}, "renderer= is for new flights, and report= reads a recorded one"),
         ({"actor": "kidney", "preset": "easy"}, "preset=easy is for actor=pilot, which is not given"),
-        ({"actor": "kidney", "link": "udp", "mass": 0.7}, "mass=0.7 is for a link that takes a throttle"),
+        ({"actor": "kidney", "link": "udp", "mass": 0.7}, "mass=0.7 is for a link that sends a throttle"),
         ({"actor": "kidney", "link": "mavlink", "arm_channel": 5}, "arm_channel=5 is for link=crsf, sbus, msp"),
         ({"actor": "kidney", "link": "sbus", "voltage_tolerance": 0.1}, "voltage_tolerance=0.1 is for link=crsf, msp"),
         (
@@ -54,10 +54,10 @@ hil = recipe_module("hil")
         ),
         ({"actor": "kidney", "pose": "ros2", "pose_port": 9200}, "pose_port=9200 is for poses over the network"),
         ({"actor": "kidney", "operator_port": 9200}, "operator_port=9200 is for operator=udp"),
-        ({"replay": "x", "track": "circle"}, "track= is for flights, and replay= is of one that was flown"),
+        ({"replay": "x", "track": "circle"}, "track= is for new flights, and replay= reads a recorded one"),
         (
             {"report": "x", "limits": flights.LimitsConfig(speed_max=9.0)},
-            "limits= is for flights, and report= is of",
+            "limits= is for new flights, and report= reads",
         ),
     ],
 )
@@ -72,14 +72,14 @@ def test_what_does_not_go_together_is_refused(changes, message):
         ({"actor": "pilot"}, "track= is missing: actor=pilot has none of its own"),
         ({"actor": "pilot", "track": "moon"}, "moon"),
         ({"actor": "kidney", "track": "circle"}, "source.track is 'kidney', .* track=circle"),
-        ({"actor": "kidney", "rate": 50.0}, "control.rate_hz is 25, and rate=50"),
-        ({"actor": "nobody"}, "actor=nobody: there is no such file or folder. Agents that ship, .*: circle"),
-        ({"actor": "kidney", "link": "crsf"}, "mass= is missing: link=crsf turns thrust into a throttle by it"),
-        ({"actor": "kidney", "device": "/dev/x"}, "device=/dev/x is for crsf, sbus, .* link=simulated goes over UDP"),
+        ({"actor": "kidney", "rate": 50.0}, "control.rate_hz is 25, but rate=50"),
+        ({"actor": "nobody"}, "actor=nobody: there is no such file or folder. Included agents, .*: circle"),
+        ({"actor": "kidney", "link": "crsf"}, "mass= is missing: link=crsf needs it to convert thrust to throttle"),
+        ({"actor": "kidney", "device": "/dev/x"}, "device=/dev/x is for crsf, sbus, .* link=simulated uses UDP"),
         ({"actor": "kidney", "betaflight_dump": "x"}, "betaflight_dump=x is for link=crsf, sbus, msp"),
         (
             {"actor": "kidney", "link": "crsf", "betaflight_dump": "x", "arm_channel": 5},
-            "betaflight_dump= is compared with arming by AUX1",
+            "betaflight_dump= is only checked for arming by AUX1",
         ),
         ({"actor": "kidney", "link": "crsf", "betaflight_dump": "/nowhere"}, "/nowhere"),
         (
@@ -165,9 +165,9 @@ def test_a_flight_controller_with_other_settings_is_refused_line_by_line(tmp_pat
     said = [" ".join(line.split()[:2]) for line in str(refused.value).splitlines()[1:]]
     assert sorted(said) == ["differs set", "missing set"] and "found 67" in str(refused.value)
     config.betaflight_dump = None
-    assert "its settings were not compared" in flights.check_flight(config, contract, kidney)[1]
+    assert "its settings were not checked" in flights.check_flight(config, contract, kidney)[1]
     config.force = False
-    with pytest.raises(ValueError, match="trained with a proportional rate loop, and link=crsf tells a Betaflight"):
+    with pytest.raises(ValueError, match="trained with a proportional rate loop, but link=crsf commands a Betaflight"):
         flights.check_flight(config, contract, kidney)
     config.arm = False  # to be carried by hand
     assert flights.check_flight(config, contract, kidney) == []
@@ -183,7 +183,7 @@ def test_what_is_believed_of_a_battery_must_be_what_can_be_reckoned_with():
     drone = {"mass": 0.6, "full_thrust": 9.0, "reference_voltage": 15.0, "voltage": 15.0}  # 11.25 V lift 5.1 N
     config = hil.HilConfig(actor="kidney", link="crsf", device="/dev/null", **drone)
     contract = hil.make_flyer(config)[1]
-    with pytest.raises(ValueError, match=r"voltage_tolerance=0.25: with it 11.25 V would be believed. .*must lift"):
+    with pytest.raises(ValueError, match=r"voltage_tolerance=0.25: it would accept a reading of 11.25 V. .*must lift"):
         hil.link_config(config, contract, 25.0)
     config.voltage_tolerance = 0.15
     assert hil.link_config(config, contract, 25.0).thrust.voltage == 15.0

@@ -162,7 +162,7 @@ def test_a_link_that_dies_is_noticed_and_the_vehicles_own_failsafe_ends_it(tmp_p
         time.sleep(0.4)
         assert len(parts.ground.listen()) == heard and parts.ground.heard[-1][1]
         said = parts.loop.end()
-    assert "ended: cut: the link has taken no command" in said
+    assert "ended: cut: the link has accepted no command" in said
     statistics = json.loads((tmp_path / "run" / "statistics.json").read_text())
     assert statistics["commands_dropped"] >= 1  # a port where nobody listens is known on the same machine
 
@@ -178,7 +178,7 @@ def flying(folder: Path) -> Iterator[tuple[Process, Process]]:
         own = ("actor=circle", "arm=true", f"run_dir={folder}", *BUSY)
         with Process("hil", *own, f"link_port={command_port}", f"pose_port={pose_port}") as loop:
             deadline = time.monotonic() + 90
-            while "the stand let go" not in plant.said and loop.running.poll() is None:
+            while "the stand released it" not in plant.said and loop.running.poll() is None:
                 assert time.monotonic() < deadline, plant.said + loop.said
                 plant.listen(0.05)
             yield plant, loop
@@ -200,7 +200,7 @@ def test_the_plant_cuts_when_the_loop_dies(tmp_path):
     with flying(tmp_path) as (plant, loop):
         loop.running.kill()
         loop.running.wait()
-        plant.wait_for("nothing heard for 0.25 s: motors cut")  # by its physics, which keeps to the clock
+        plant.wait_for("no message for 0.25 s: motors are cut")  # by its physics, which keeps to the clock
         plant.running.send_signal(signal.SIGTERM)
         plant.end()
     assert plant.running.returncode == 0

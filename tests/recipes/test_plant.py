@@ -75,7 +75,7 @@ def test_a_commander_flies_it_over_loopback_until_sigterm() -> None:
     took, stamped = received[-1].time - received[0].time, packets[-1].stamp - packets[0].stamp
     late = float(re.search(r"late \d+ times \(by (\d+) ms at most\)", said)[1]) / 1e3 if "late" in said else 0.0
     assert -0.1 * took < took - stamped < 0.1 * took + late, said  # it keeps to the clock, or says how far it is behind
-    assert "the stand let go" in said
+    assert "the stand released it" in said
     assert "0 gates in order, 0 laps, crash: none, 60 commands (0 lost, 0 stale, 1 malformed), 0 failsafe(s)" in said
 
 
@@ -113,7 +113,7 @@ def test_a_stand_in_for_the_firmware_flies_it_over_loopback_until_sigint() -> No
         over.set()
         thread.join(5.0)
     state.close()
-    assert "the stand let go" in said and "crash: none" in said, said
+    assert "the stand released it" in said and "crash: none" in said, said
     assert int(re.search(r"(\d+) motor packets \(0 malformed\), 0 failsafe", said)[1]) > 300, said
 
 
@@ -148,7 +148,7 @@ def test_one_command_starts_a_real_firmware_that_flies_it_and_stops_it() -> None
         link.close()
     poses.close()
     assert height >= 1.5, (refusal, said)
-    assert "set up in an empty folder" in said and "the stand let go" in said
+    assert "set up in an empty folder" in said and "the stand released it" in said
     with socket.socket() as gone:
         assert gone.connect_ex(("127.0.0.1", ports.serial)) != 0, "it was stopped"
 
@@ -167,7 +167,7 @@ def test_a_port_in_use_is_one_paragraph(tmp_path: Path) -> None:
         (["mass=9"], "mass=9.0: must be at least 0.5 and at most 2"),
         (["betaflight=2026.6", "delay=0.01"], "delay=0.01 is for commands"),
         (["actor=circle"], "actor=circle is for firmware="),
-        (["firmware=/nowhere", "motor_port=0"], "/nowhere is no program of a Betaflight"),
+        (["firmware=/nowhere", "motor_port=0"], "/nowhere is not an executable Betaflight"),
     ],
 )
 def test_refusals_say_what_is_wrong(overrides: list[str], message: str, tmp_path: Path) -> None:

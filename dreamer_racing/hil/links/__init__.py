@@ -92,16 +92,16 @@ def make_link(config: LinkConfig) -> TransportLink:
         >>> make_link(LinkConfig("udp", port=9100)).close()
     """
     if config.name not in LINKS:
-        raise ValueError(f"name={config.name}: the links are {', '.join(LINKS)}.")
+        raise ValueError(f"name={config.name}: must be one of {', '.join(LINKS)}.")
     if config.device is not None and config.name not in PROTOCOLS:
         raise ValueError(
-            f"device={config.device} is for {', '.join(PROTOCOLS)}, and link={config.name} goes over UDP: choose one "
-            "of those, or leave device= out."
+            f"device={config.device} is for {', '.join(PROTOCOLS)}, but link={config.name} uses UDP: choose one of "
+            "those, or leave device= out."
         )
     if config.imu and config.name not in IMU_LINKS:
         raise ValueError(
-            f"link={config.name} does not bring back what the IMU tells, and the actor flies by it: the links that do "
-            f"are {', '.join(IMU_LINKS)}."
+            f"link={config.name} does not return IMU samples, which the actor needs: must be one of "
+            f"{', '.join(IMU_LINKS)}."
         )
     link = LINKS[config.name](config)
     try:
@@ -122,8 +122,8 @@ def _check_speed(link: TransportLink, config: LinkConfig) -> None:
     if config.rate > most:
         raise ValueError(
             f"baud={settings.baud}: a command of {size} bytes takes {1e3 * settings.seconds(size):.1f} ms on the wire, "
-            f"so at most {most:.0f} go over it in a second, and the actor gives {config.rate:g}: choose a higher baud= "
-            "on both sides."
+            f"so at most {most:.0f} can be sent in a second, but the actor gives {config.rate:g}: choose a higher "
+            "baud= on both sides."
         )
 
 

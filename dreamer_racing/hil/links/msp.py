@@ -134,15 +134,15 @@ class MspTelemetry(Telemetry):
             return self._taken_back()
         if status is None or status.armed:
             return ""
-        return status.words or ("it has not armed, and gives no reason: is arm_channel= its switch?" if armed else "")
+        return status.words or ("it has not armed and gives no reason: is arm_channel= its switch?" if armed else "")
 
     def _taken_back(self) -> str:
         """Return why the pilot or the modes prevent the override; empty if nothing does."""
         status, boxes = self.status, self.boxes
         if status is None or boxes is None:
-            return "nothing was heard of it"
+            return "no status was received from it"
         if MSP_OVERRIDE not in boxes:
-            return "it has no mode MSP OVERRIDE: see msp_override_channels_mask, and put the mode on a switch"
+            return "it has no mode MSP OVERRIDE: see msp_override_channels_mask, and assign the mode to a switch"
         on = {box for bit, box in enumerate(boxes) if status.modes >> bit & 1}
         if not status.armed:
             return "the pilot has not armed it" + (f": {status.words}" if status.words else "")

@@ -43,9 +43,9 @@ BACKLOG = 2
 
 _REMEDIES = {
     errno.ENOENT: "there is no such device. Is it plugged in? Look into /dev/serial/by-id",
-    errno.EACCES: "you may not use it: sudo usermod -aG dialout $USER, and log in again",
-    errno.EAGAIN: "another program uses it: a configurator, or a second pilot?",
-    errno.EBUSY: "another program uses it: a configurator, or a second pilot?",
+    errno.EACCES: "you have no permission to use it: sudo usermod -aG dialout $USER, and log in again",
+    errno.EAGAIN: "another program uses it: a configurator, or another flight?",
+    errno.EBUSY: "another program uses it: a configurator, or another flight?",
 }
 
 

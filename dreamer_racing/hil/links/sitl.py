@@ -67,10 +67,10 @@ class SitlTransport:
             return
         status = self._boots.status
         if status is not None and not NOT_READY.intersection(status.names):
-            logger.info("the firmware has booted: it is sent channels from now on")
+            logger.info("the firmware has booted: channels are sent to it from now on")
             self._boots = None
         elif status is None and time.monotonic() - self._asked_at > self.ANSWERS_WITHIN:
-            logger.warning("the firmware does not say whether it has booted: it is sent channels all the same")
+            logger.warning("the firmware does not report whether it has booted: channels are sent to it anyway")
             self._boots = None
 
     def discard(self) -> None:

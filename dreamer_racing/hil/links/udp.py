@@ -28,7 +28,14 @@ _BODY = struct.Struct("<4sIdB4d")
 _CHECK = struct.Struct("<I")
 PACKET_SIZE = _BODY.size + _CHECK.size
 """Bytes of a packet: 53."""
-_PASSING = {errno.EAGAIN, errno.ECONNREFUSED, errno.ENOBUFS, errno.ENETDOWN, errno.ENETUNREACH, errno.EHOSTUNREACH}
+_PASSING = {
+    errno.EAGAIN,
+    errno.ECONNREFUSED,
+    errno.ENOBUFS,
+    errno.ENETDOWN,
+    errno.ENETUNREACH,
+    errno.EHOSTUNREACH,
+}
 
 
 class CommandPacket(NamedTuple):
@@ -89,7 +96,7 @@ class UdpTransport:
             self._socket.connect((host, port))
         except (OSError, OverflowError) as error:
             self._socket.close()
-            raise OSError(f"host={host}, port={port}: cannot be sent to: {error}") from error
+            raise OSError(f"host={host}, port={port}: cannot send there: {error}") from error
 
     def write(self, data: bytes) -> bool:
         """Send a datagram; return whether that worked: not if buffers are full or the last one reached no listener."""

@@ -68,7 +68,7 @@ def make_poses(config: PoseConfig) -> PoseSource:
         >>> make_poses(PoseConfig("udp", port=0)).close()
     """
     if config.name not in POSE_SOURCES:
-        raise ValueError(f"name={config.name}: the pose sources are {', '.join(POSE_SOURCES)}.")
+        raise ValueError(f"name={config.name}: must be one of {', '.join(POSE_SOURCES)}.")
     return POSE_SOURCES[config.name](config)
 
 
@@ -101,7 +101,7 @@ def _message(config: PoseConfig, messages: Iterable[str]) -> str:
     known = list(messages)
     message = known[0] if config.message is None else config.message
     if message not in known:
-        raise ValueError(f"message={message}: the pose source {config.name} knows {', '.join(known)}.")
+        raise ValueError(f"message={message}: for the pose source {config.name}, must be one of {', '.join(known)}.")
     return message
 
 

@@ -221,7 +221,7 @@ def test_a_device_of_another_user(monkeypatch):
         raise serial.SerialException(errno.EACCES, "could not open port: Permission denied")
 
     monkeypatch.setattr(serial, "Serial", refuse)
-    with pytest.raises(OSError, match="device=/dev/ttyUSB0: you may not use it: sudo usermod -aG dialout"):
+    with pytest.raises(OSError, match="device=/dev/ttyUSB0: you have no permission to use it: sudo usermod"):
         SerialPort("/dev/ttyUSB0", MSP)
 
 

@@ -122,7 +122,7 @@ def test_one_whose_serial_port_somebody_else_has_is_sent_channels_after_a_while(
     assert not transport.write(b"2")
     now[0] += 0.2
     assert transport.write(b"3") and channels.sent == [b"3"]
-    assert "does not say whether it has booted" in caplog.text
+    assert "does not report whether it has booted" in caplog.text
     transport.close()
 
 
@@ -149,7 +149,7 @@ def test_what_keeps_it_from_arming_is_said_in_its_words() -> None:
     telemetry = MspTelemetry()
     assert telemetry.refusal(True) == "", "before it has said anything"
     telemetry.read(status(flags=THROTTLE | RXLOSS))
-    assert telemetry.refusal(False) == ("RXLOSS: it hears no valid channels; THROTTLE: the throttle is not low")
+    assert telemetry.refusal(False) == ("RXLOSS: it receives no valid channels; THROTTLE: the throttle is not low")
     telemetry.read(status())
     assert telemetry.refusal(False) == "" and "gives no reason" in telemetry.refusal(True)
     telemetry.read(status(modes=ARM, flags=THROTTLE))
@@ -161,7 +161,7 @@ def test_what_keeps_it_from_arming_is_said_in_its_words() -> None:
 @pytest.mark.parametrize(
     ("modes", "flags", "words"),
     [
-        (0, RXLOSS, "the pilot has not armed it: RXLOSS: it hears no valid channels"),
+        (0, RXLOSS, "the pilot has not armed it: RXLOSS: it receives no valid channels"),
         (OVERRIDE, 0, "the pilot has not armed it"),
         (ARM, 0, "the pilot flies it: MSP OVERRIDE is off"),
         (ARM | OVERRIDE | ANGLE, 0, "it levels itself: switch ANGLE and HORIZON off"),
@@ -170,9 +170,9 @@ def test_what_keeps_it_from_arming_is_said_in_its_words() -> None:
 )
 def test_beside_a_receiver_the_pilot_arms_and_hands_over(modes: int, flags: int, words: str) -> None:
     telemetry = MspTelemetry(override=True)
-    assert telemetry.refusal(False) == "nothing was heard of it"
+    assert telemetry.refusal(False) == "no status was received from it"
     telemetry.read(status(modes, flags))
-    assert telemetry.refusal(False) == "nothing was heard of it"
+    assert telemetry.refusal(False) == "no status was received from it"
     telemetry.read(frame(119, BOXES))
     assert telemetry.refusal(False) == telemetry.refusal(True) == words
     telemetry.read(frame(119, BOXES[:-1]))
@@ -187,7 +187,7 @@ def test_beside_a_receiver_nothing_that_is_sent_could_arm(server: socket.socket)
     firmware = server.accept()[0]
     second = link.send(at_rest())
     assert decode_msp(second[:14]) == (1500.0, 1500.0, 1000.0, 1500.0) and second[14:] == IMU_REQUEST
-    assert link.refusal == "nothing was heard of it"
+    assert link.refusal == "no status was received from it"
     firmware.sendall(frame(119, BOXES) + status(ARM | OVERRIDE))
     deadline = time.monotonic() + 5.0
     while link.refusal and time.monotonic() < deadline:

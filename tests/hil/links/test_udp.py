@@ -111,7 +111,7 @@ def test_a_closed_link_says_so(listener):
 
 @pytest.mark.parametrize(("host", "port"), [("no.such.host.invalid", 9100), ("127.0.0.1", 70000)])
 def test_nowhere_to_send_to(host, port):
-    with pytest.raises(OSError, match=f"host={host}, port={port}: cannot be sent to"):
+    with pytest.raises(OSError, match=f"host={host}, port={port}: cannot send there"):
         UdpTransport(host, port)
 
 
@@ -247,7 +247,7 @@ def test_the_arm_channel_is_the_one_chosen():
 
 
 def test_unknown_links():
-    with pytest.raises(ValueError, match=f"name=carrier_pigeon: the links are {', '.join(LINKS)}"):
+    with pytest.raises(ValueError, match=f"name=carrier_pigeon: must be one of {', '.join(LINKS)}"):
         make_link(LinkConfig("carrier_pigeon"))
 
 

@@ -208,18 +208,18 @@ def test_udp_is_the_pose_packet():
 @pytest.mark.parametrize(
     ("config", "message"),
     [
-        (PoseConfig("vicon"), "name=vicon: the pose sources are udp, mavlink, ros2."),
+        (PoseConfig("vicon"), "name=vicon: must be one of udp, mavlink, ros2."),
         (PoseConfig("udp"), "port is not given: the pose source udp needs it."),
         (PoseConfig("mavlink"), "port or device is not given: the pose source mavlink needs it."),
         (PoseConfig("ros2"), "topic is not given: the pose source ros2 needs it."),
         (
             PoseConfig("mavlink", port=0, message="HEARTBEAT"),
-            "message=HEARTBEAT: the pose source mavlink knows "
+            "message=HEARTBEAT: for the pose source mavlink, must be one of "
             "ODOMETRY, LOCAL_POSITION_NED, VISION_POSITION_ESTIMATE, ATT_POS_MOCAP.",
         ),
         (
             PoseConfig("ros2", topic="/pose", message="Imu"),
-            "message=Imu: the pose source ros2 knows PoseStamped, Odometry.",
+            "message=Imu: for the pose source ros2, must be one of PoseStamped, Odometry.",
         ),
     ],
 )
