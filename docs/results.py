@@ -64,7 +64,8 @@ lap time           best 3.96 s, mean 4.06 s (297 laps)
 
 | word | meaning on this page |
 |---|---|
-| success | share of flights that finish three laps, each from another randomised start, by the deterministic policy. Of 100 flights, 97 % means 92 to 99 % (95 % interval), 55 % means 45 to 64 % |
+| success | share of flights that finish three laps, each from another randomised start, by the deterministic policy |
+| … of 100 flights | 97 % means 92 to 99 %, 55 % means 45 to 64 % (95 % intervals) |
 | sampled | success of the stochastic policy, whose actions are samples from its distribution |
 | last weights | the averaged ones (`model.average_rate`), as in flight |
 | lap | mean over all complete laps, the first from rest, also of flights that crash later |
@@ -75,8 +76,8 @@ lap time           best 3.96 s, mean 4.06 s (297 laps)
 FOOT = """## Where the numbers come from
 
 The commands on this page use today's defaults; the original ones are behind *Commands, commits, machine*. Before commit
-2c16a57 latent PPO was called `recipes/dreamer_v3.py`, so a `dreamer_v3.py` of those commits is latent PPO. `./dev python docs/results.py`
-writes this page from the `provenance.json` files in [results/](../results): change those."""
+2c16a57 latent PPO was called `recipes/dreamer_v3.py`, so a `dreamer_v3.py` of those commits is latent PPO.
+`./dev python docs/results.py` writes this page from the `provenance.json` files in [results/](../results): change those."""
 
 
 @dataclass
