@@ -38,20 +38,20 @@ def ensure_caches() -> str:
     reason = why_not_writable(folder)
     if not reason:
         return ""
-    reason = f"{folder} takes no files ({reason})"
+    reason = f"cannot write to {folder} ({reason})"
     try:
         temporary = Path(tempfile.mkdtemp(prefix="dreamer_racing_"))
     except OSError as error:
         raise CacheError(
-            f"There is nowhere to put what warp compiles: {reason}, and no temporary folder can be made "
-            f"({error}). WARP_CACHE_PATH=FOLDER names one that can be written to."
+            f"There is no folder for Warp's compiled kernels: {reason}, and no temporary folder can be made ({error}). "
+            "Set WARP_CACHE_PATH=FOLDER to a writable one."
         ) from error
     atexit.register(_remove, temporary, os.getpid())
     os.environ["WARP_CACHE_PATH"] = str(temporary / "warp")
     os.environ.setdefault("MPLCONFIGDIR", str(temporary / "matplotlib"))
     logger.warning(
-        "%s: what is compiled lies in a temporary folder, and every program compiles it anew, some ten seconds. "
-        "WARP_CACHE_PATH=FOLDER names one that lasts.",
+        "%s: compiled kernels are in a temporary folder, so every program compiles them again (about ten seconds). Set "
+        "WARP_CACHE_PATH=FOLDER to keep them.",
         reason,
     )
     return reason
@@ -72,7 +72,7 @@ def warp_cache() -> Path:
 def why_not_writable(folder: Path) -> str:
     """Return why a folder is not writable, or an empty string if it is; a missing folder is created."""
     if str(folder).startswith("~"):
-        return "this user has no home"
+        return "this user has no home directory"
     try:
         folder.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryFile(dir=folder) as file:

@@ -27,7 +27,7 @@ def choose_device(device: str) -> torch.device:
         available = ["cpu", *(f"cuda:{index}" for index in range(torch.cuda.device_count()))]
         raise ValueError(
             f"device={device}: {str(error).splitlines()[0].rstrip('.')}. This machine has: {', '.join(available)}; "
-            "device=auto takes the best."
+            "device=auto chooses the best."
         ) from error
     return chosen
 

@@ -167,7 +167,7 @@ def cores() -> Iterator[Diagnosis]:
     available = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
     load = os.getloadavg()[0]
     busy = load > 0.5 * available
-    remedy = "other processes take their time from a training; two trainings want OMP_NUM_THREADS=1 each"
+    remedy = "other processes slow a training down; two trainings need OMP_NUM_THREADS=1 each"
     found = f"{available}, load {load:.1f}"
     yield Diagnosis("cores", Verdict.note if busy else Verdict.fine, found, remedy if busy else "")
     threads = os.environ.get("OMP_NUM_THREADS")
@@ -178,8 +178,8 @@ def cores() -> Iterator[Diagnosis]:
     yield Diagnosis("threads", Verdict.wrong if too_many else Verdict.fine, found, remedy)
     flags = Path("/proc/cpuinfo").read_text(encoding="utf-8") if Path("/proc/cpuinfo").exists() else ""
     bfloat16 = [name for name in ("amx_bf16", "avx512_bf16") if name in flags]
-    found = f"{', '.join(bfloat16)}: a training measures whether it is faster by that" if bfloat16 else ""
-    yield Diagnosis("bfloat16", Verdict.fine, found or "not computed by this CPU: mixed precision is off")
+    found = f"{', '.join(bfloat16)}: a training measures whether this is faster" if bfloat16 else ""
+    yield Diagnosis("bfloat16", Verdict.fine, found or "not supported by this CPU: mixed precision is off")
 
 
 def memory(needed: float) -> Diagnosis:
@@ -198,7 +198,7 @@ def disk(needed: float, run_dir: Path) -> Diagnosis:
     """Check that checkpoints can be written and fit on the disk; ``needed`` is in bytes."""
     place = next(folder for folder in (run_dir.absolute(), *run_dir.absolute().parents) if folder.is_dir())
     if reason := why_not_writable(place):
-        return Diagnosis("disk", Verdict.wrong, f"{place} takes no files ({reason})", "choose another run_dir=")
+        return Diagnosis("disk", Verdict.wrong, f"cannot write to {place} ({reason})", "choose another run_dir=")
     free = shutil.disk_usage(place).free
     found = f"{free / 1e9:.1f} GB free at {run_dir}, checkpoints of such a run take about {needed / 1e9:.1f}"
     return Diagnosis("disk", *_enough(found, free >= needed, "lower checkpoint.keep= or choose another run_dir="))
@@ -207,7 +207,7 @@ def disk(needed: float, run_dir: Path) -> Diagnosis:
 def caches() -> Diagnosis:
     """Check that compiled kernels can be cached for the next program."""
     if reason := ensure_caches():
-        remedy = "WARP_CACHE_PATH=FOLDER, or a HOME that can be written to; until then every program compiles anew"
+        remedy = "WARP_CACHE_PATH=FOLDER, or a writable HOME; until then every program compiles again"
         return Diagnosis("caches", Verdict.note, reason, remedy)
     return Diagnosis("caches", Verdict.fine, str(warp_cache()))
 
@@ -229,25 +229,25 @@ def renderers(probes: dict[str, subprocess.Popen[str]]) -> Iterator[Diagnosis]:
             found[backend] = int(printed)
         else:
             reasons[backend] = (
-                errors.strip().splitlines()[-1].partition(": ")[2] if errors.strip() else "its probe died"
+                errors.strip().splitlines()[-1].partition(": ")[2] if errors.strip() else "its test process failed"
             )
     for backend, images in found.items():
         yield Diagnosis(backend, Verdict.fine, f"{images:,} images a second, 64 × 64 pixels, one core")
     for backend, reason in reasons.items():
         named = sorted(name for name in VARIABLES if f"{name}=" in reason)
         remedy = f"unset {' '.join(named)}" if named else ""
-        yield Diagnosis(backend, Verdict.fine if found and not named else Verdict.note, f"not here: {reason}", remedy)
+        yield Diagnosis(backend, Verdict.fine if found and not named else Verdict.note, f"fails: {reason}", remedy)
     if not found:
         installed = any(loads(library) for library in GL_LIBRARIES["egl"])
         remedy = "" if installed else "apt-get install libegl1 libopengl0 libgl1-mesa-dri: seven times as fast"
-        yield Diagnosis("ray caster", Verdict.note, "draws, for want of OpenGL", remedy)
+        yield Diagnosis("ray caster", Verdict.note, "is used, because OpenGL does not work", remedy)
 
 
 def variables() -> Iterator[Diagnosis]:
     """Report environment variables that would break OpenGL and were therefore ignored."""
     for setting, reason in unset_variables.items():
         name = setting.partition("=")[0]
-        yield Diagnosis(name, Verdict.note, f"{setting} is left out of account: {reason}", f"unset {name}")
+        yield Diagnosis(name, Verdict.note, f"{setting} is ignored: {reason}", f"unset {name}")
 
 
 def _start_probe(backend: str) -> subprocess.Popen[str]:

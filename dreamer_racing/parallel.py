@@ -53,8 +53,8 @@ def init() -> None:
         dist.init_process_group(backend, timeout=PATIENCE)
     except ValueError as error:
         raise ValueError(
-            f"WORLD_SIZE={asked_for()} says that this is one of several processes, and they cannot meet ({error}): "
-            "start them by torchrun --nproc-per-node=N, or unset WORLD_SIZE."
+            f"WORLD_SIZE={asked_for()} says that this is one of several processes, and they cannot connect ({error}): "
+            "start them with torchrun --nproc-per-node=N, or unset WORLD_SIZE."
         ) from error
     _here.rank, _here.processes = dist.get_rank(), dist.get_world_size()
     if (device := int(os.environ.get("LOCAL_RANK") or 0)) < torch.cuda.device_count():
@@ -201,8 +201,8 @@ def check_same(values: Sequence[Tensor]) -> None:
         sums = torch.stack([value.double().sum() for value in values]).tolist()
     if any(other != sums for other in _all_gather_objects(sums)):
         raise RuntimeError(
-            "The networks of the processes are no longer the same, so their averaged gradients mean nothing: they must "
-            "run on devices of one kind with the same versions. This should be reported as a defect if they do."
+            "The networks differ between the processes, so averaged gradients are meaningless. All processes must have "
+            "the same kind of device and the same versions. If they do, please report this as a bug."
         )
 
 

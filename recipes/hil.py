@@ -88,7 +88,7 @@ def make_flyer(config: HilConfig, track: Track | None = None) -> tuple[Flyer, di
         return PilotFlyer(track or load_track(config.track), config.preset, rate), pilot_contract(config)
     if config.actor == IDENTIFY:
         if config.track is None:
-            raise ValueError("track= is missing: actor=identify begins at its start, and stays within its bounds.")
+            raise ValueError("track= is missing: actor=identify needs its start and its bounds.")
         steps = IdentificationFlyer()
         config.duration = config.duration or steps.duration + SPARE
         return steps, pilot_contract(config)

@@ -198,7 +198,7 @@ def test_an_evaluation_is_written_though_nobody_reads(monkeypatch: pytest.Monkey
     assert list(written) == report.written == ["deterministic", "stochastic"]
 
 
-# Programs of a user whose home takes no files.
+# Programs of a user whose home is not writable.
 
 
 @pytest.fixture
@@ -217,7 +217,7 @@ def test_a_race_is_flown_and_it_is_said_once_and_nothing_is_left(tmp_path: Path,
         [sys.executable, "-c", program], env=homeless, capture_output=True, text=True, timeout=300, check=False
     )
     assert done.returncode == 0, done.stderr
-    assert done.stderr.count("takes no files (Not a directory)") == 1 and "WARP_CACHE_PATH=FOLDER" in done.stderr
+    assert done.stderr.count("(Not a directory)") == 1 and "WARP_CACHE_PATH=FOLDER" in done.stderr
     assert list((tmp_path / "temporary").glob("dreamer_racing_*")) == []
 
 
@@ -227,14 +227,14 @@ def test_the_doctor_says_so(tmp_path: Path, homeless: dict[str, str]) -> None:
         env=homeless, cwd=tmp_path, capture_output=True, text=True, timeout=300, check=False,
     )  # fmt: skip
     (line,) = [line for line in done.stdout.splitlines() if line.startswith("caches")]
-    assert "note" in line and "takes no files" in line
+    assert "note" in line and "cannot write to" in line
     assert "Matplotlib created" not in done.stderr
 
 
 def test_the_doctor_tries_to_write_where_runs_go(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(doctor, "why_not_writable", lambda folder: "Read-only file system")
     found = doctor.disk(1.0, tmp_path / "runs")
-    assert found.state.name == "wrong" and f"{tmp_path} takes no files (Read-only file system)" in found.found
+    assert found.state.name == "wrong" and f"cannot write to {tmp_path} (Read-only file system)" in found.found
 
 
 def test_without_any_folder_it_is_said_what_to_set(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -251,5 +251,5 @@ def test_a_user_without_a_home_does_not_write_to_the_working_directory(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(tmp_path)
-    assert caches.why_not_writable(Path("~/.cache/warp")) == "this user has no home"
+    assert caches.why_not_writable(Path("~/.cache/warp")) == "this user has no home directory"
     assert list(tmp_path.iterdir()) == []

@@ -84,7 +84,7 @@ def join(address: str) -> bool:
         return False
     os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")  # send no usage statistics
     try:
-        _knock(address)
+        _check_reachable(address)
         ray.init(address=address, include_dashboard=False, logging_level=logging.WARNING)
     except (OSError, RuntimeError, ValueError, ray.exceptions.RayError) as error:
         raise ValueError(
@@ -95,7 +95,7 @@ def join(address: str) -> bool:
     return True
 
 
-def _knock(address: str) -> None:
+def _check_reachable(address: str) -> None:
     """Raise ``OSError`` if nothing answers at ``host:port``; Ray itself would retry for minutes."""
     host, colon, port = address.rpartition(":")
     if colon and port.isdigit() and "/" not in host:
@@ -192,7 +192,7 @@ def start_workers(
     import ray
     from torchrl.collectors.distributed import RayCollector
 
-    _await_room(workers, share)
+    _await_resources(workers, share)
     check_nodes(share, make_env, policy)
     try:
         return RayCollector(
@@ -275,7 +275,7 @@ def _try_out(make_env: Callable[[], EnvBase], policy: DreamerPolicy) -> dict[str
     return versions()
 
 
-def _await_room(workers: int, share: WorkersConfig) -> None:
+def _await_resources(workers: int, share: WorkersConfig) -> None:
     """Check resources repeatedly for some seconds, because a run that has just ended may still release some."""
     for left in reversed(range(10)):
         try:

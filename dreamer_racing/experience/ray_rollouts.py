@@ -194,8 +194,8 @@ class RayRollouts(Rollouts):
             if pending and waited >= self._patience:
                 raise WorkerError(
                     f"Worker {late} of {len(asked)} did not answer for {waited:.0f} s "
-                    f"(workers.patience={self._patience:g}): {_room()}. Resume with a lower num_workers=, or when the "
-                    "cluster has free resources again."
+                    f"(workers.patience={self._patience:g}): {_resources()}. Resume with a lower num_workers=, or when "
+                    "the cluster has free resources again."
                 )
             if pending and waited - reminded >= REMIND:
                 logger.warning(
@@ -245,7 +245,7 @@ def _listed(workers: Sequence[int]) -> str:
     return ", ".join(map(str, workers))
 
 
-def _room() -> str:
+def _resources() -> str:
     """Return a description of the free resources of the cluster."""
     nodes, free = ray_cluster.resources()
     total = {name: sum(node.get(name, 0.0) for node in nodes) for name in ("CPU", "GPU")}

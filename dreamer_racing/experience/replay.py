@@ -209,7 +209,7 @@ class StreamReplay(TensorDictReplayBuffer):
         """
         here, wanted, before = self._writer, range(skip, skip + self._writer.num_streams), 0
         streams = {"num_streams": here.num_streams, "stream_length": here.stream_length, "write_count": 0}
-        dealt: list[tuple[Path, dict[str, Any], range, int]] = []  # folder, its state, chosen streams, first target
+        assigned: list[tuple[Path, dict[str, Any], range, int]] = []  # folder, its state, chosen streams, first target
         cursor, filled = list[int](), list[int]()
         for path in map(Path, paths):
             state = self._read_state(path)
@@ -217,7 +217,7 @@ class StreamReplay(TensorDictReplayBuffer):
             StreamWriter(saved["num_streams"], here.stream_length).check(saved)
             begin, end = (min(max(stream - before, 0), saved["num_streams"]) for stream in (skip, wanted.stop))
             chosen = range(begin, end)
-            dealt.append((path, state, chosen, len(filled)))
+            assigned.append((path, state, chosen, len(filled)))
             cursor += [saved["cursor"][stream] for stream in chosen]
             filled += [saved["filled"][stream] for stream in chosen]
             before += saved["num_streams"]
@@ -227,7 +227,7 @@ class StreamReplay(TensorDictReplayBuffer):
                 "the same number of environments."
             )
         here.load_state_dict({**streams, "cursor": cursor, "filled": filled, "write_count": sum(filled)})
-        for path, state, chosen, first in dealt:
+        for path, state, chosen, first in assigned:
             self._read_streams(path, state, chosen, first)
 
     def _read_state(self, path: Path) -> dict[str, Any]:

@@ -190,7 +190,7 @@ class RunCheckpoints:
         own = {name: part for name, part in parts.items() if name in self._own or name == "random_state"}
         if (saved := metadata.get(PROCESSES, 1)) != parallel.num_processes():
             _load_sound(source, {name: part for name, part in parts.items() if name not in own}, map_location, may_lack)
-            self._deal(source, saved)
+            self._redistribute(source, saved)
         elif parallel.is_first():
             _load_sound(source, parts, map_location, may_lack)
         else:
@@ -198,7 +198,7 @@ class RunCheckpoints:
             _load_sound(source / f"{PROCESS}{parallel.rank()}", own, map_location, ())
         return metadata
 
-    def _deal(self, source: Path, saved: int) -> None:
+    def _redistribute(self, source: Path, saved: int) -> None:
         """Redistribute the streams of replays that another number of processes saved.
 
         Streams are ordered by descending rank, so that rank 0 gets the last ones, which may be held out.

@@ -35,10 +35,10 @@ def plain_errors(applies: Callable[[], bool] = lambda: True, also: tuple[type[Ex
             training are defects, and keep their tracebacks.
         also: further types of errors that the user can fix here.
     """
-    mended: tuple[type[Exception], ...] = (MissingMandatoryValue, ValueError, OSError, RendererUnavailableError, *also)
+    errors: tuple[type[Exception], ...] = (MissingMandatoryValue, ValueError, OSError, RendererUnavailableError, *also)
     try:
         yield
-    except mended as error:
+    except errors as error:
         if not applies():
             raise
         missing = isinstance(error, MissingMandatoryValue)

@@ -241,10 +241,10 @@ def resumed_config(algorithm: str, resume: str, overrides: list[str]) -> tuple[D
                 f"{run_dir} was trained with {name}={trained}, which cannot change: leave {override} out, or start a "
                 "new run."
             )
-    begun_with = [
+    saved_overrides = [
         text for text in map(str, read_yaml(directory.overrides, ListConfig)) if override_key(text) != "run_dir"
     ]
-    merged = merge_overrides([*begun_with, as_override("run_dir", run_dir)], overrides)
+    merged = merge_overrides([*saved_overrides, as_override("run_dir", run_dir)], overrides)
     config = hydra.compose(algorithm, merged)
     restore_saved_settings(config, known, {override_key(override) for override in overrides})
     config.track_description = known.track_description  # even if tuned= or budget= is given

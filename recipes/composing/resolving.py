@@ -143,10 +143,10 @@ def print_tuned(config: DictConfig) -> None:
     """Print what the chosen settings of the group `tuned` mean, and which of them have other values here."""
     if config.tuned not in ("auto", "none") and (CONFIG_DIR / "tuned" / f"{config.tuned}.yaml").is_file():
         files = [CONFIG_DIR / "tuned" / folder / f"{config.tuned}.yaml" for folder in ("", config.algorithm)]
-        said_there = [line for file in files if file.exists() for line in head_of(file)]
-        every = f"recipes/config/tuned/{config.tuned}.yaml and tuned/{config.algorithm} have all values"
-        first = f"settings: tuned={config.tuned}, for {NAMES[config.algorithm]} {said_there[0]}"
-        print("\n  ".join((first, *said_there[1:], every)))
+        description = [line for file in files if file.exists() for line in head_of(file)]
+        files_hint = f"recipes/config/tuned/{config.tuned}.yaml and tuned/{config.algorithm} have all values"
+        first = f"settings: tuned={config.tuned}, for {NAMES[config.algorithm]} {description[0]}"
+        print("\n  ".join((first, *description[1:], files_hint)))
         if changed := changed_from_tuned(config):
             print(f"settings that differ from tuned={config.tuned} (its values in brackets): {', '.join(changed)}")
         print(f"length: {config.total_env_steps:,} env_steps; the progress shows the measured time left")

@@ -379,7 +379,7 @@ def test_load_refuses_other_shapes(tmp_path):
     assert int(other.writer.filled.sum()) == len(other) < len(replay)
 
 
-def test_what_repeats_takes_little_room(tmp_path):
+def test_repeated_records_compress_well(tmp_path):
     replay = make_replay(600, 2, 6, 4)
     replay.extend(collect(CountingEnv(2, image_shape=(64, 64, 3)), steps=200, batches=1)[0])  # images of one colour
     replay.dump(tmp_path)

@@ -83,14 +83,14 @@ def test_an_episode_that_was_broken_off_ends_at_its_last_step():
     assert storage.steps["done"][:, :, 0].tolist() == [[False, False], [False, True], [False, False], [False, False]]
 
 
-def test_another_number_of_environments_begins_anew():
+def test_another_number_of_environments_empties_the_storage():
     storage = RolloutStorage(2 * N * T)
     storage.extend(make_rollout(3))
     storage.extend(make_rollout(6))
     assert storage.steps.batch_size == (4, 6) and storage.full
 
 
-def test_another_length_begins_anew_where_rollouts_do_not_add_up_to_whole_ones():
+def test_another_rollout_length_empties_the_storage_if_it_does_not_fit():
     storage = RolloutStorage(2 * N * T)
     storage.extend(make_rollout(steps=4))
     storage.extend(make_rollout(steps=8))  # room for 8 steps either way, and 4 are kept

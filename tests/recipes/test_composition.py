@@ -129,7 +129,7 @@ def resolved_on(device: str, monkeypatch: pytest.MonkeyPatch, *overrides: str, n
         (["tuned=suite", "env=dmc"], ("cpu_small", 16, 32, True, True)),
     ],
 )
-def test_on_cuda_windows_are_short_and_warm_and_updates_a_graph(
+def test_on_cuda_windows_are_short_with_stored_latents_and_updates_a_graph(
     monkeypatch: pytest.MonkeyPatch, overrides: list[str], expected: tuple
 ) -> None:
     config = resolved_on("cuda", monkeypatch, *overrides)
@@ -138,7 +138,7 @@ def test_on_cuda_windows_are_short_and_warm_and_updates_a_graph(
     OmegaConf.to_object(config).check()
 
 
-def test_on_a_cpu_nothing_of_that_is_chosen(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_on_a_cpu_windows_are_not_shortened_and_no_graph_is_captured(monkeypatch: pytest.MonkeyPatch) -> None:
     config = resolved_on("cpu", monkeypatch, "model=size12m")
     assert (config.model.batch_size, config.model.batch_length) == (16, 64)
     assert (config.replay.context, config.model.cuda_graph, config.model.few_kernels) == (False, False, None)
@@ -168,12 +168,12 @@ def test_few_worlds_hold_nothing_out_unless_asked(capsys: pytest.CaptureFixture[
     ("name", "override"),
     [("dreamer_v3", "loss.actor=dynamics"), ("dreamer_v3", "replay.held_out=0"), ("latent_ppo", "loss.critic=latent")],
 )
-def test_what_races_goes_with_other_actors(name: str, override: str) -> None:
+def test_tuned_race_works_with_other_actors(name: str, override: str) -> None:
     config = recipe_module(name).resolve(compose(name, "tuned=race", override))
     OmegaConf.to_object(config).check()
 
 
-def test_settings_that_race_yield_to_the_command_line() -> None:
+def test_the_command_line_overrides_tuned_race() -> None:
     tuned = compose("latent_ppo", "tuned=race")
     assert (tuned.model.size, tuned.loss.world_model, tuned.loss.privileged_scale) == ("cpu_small", "privileged", 50)
     assert (tuned.env.control_rate, tuned.env.start_on_line, tuned.loss.discount) == (25, 0.7, 0.98)
@@ -185,7 +185,7 @@ def test_settings_that_race_yield_to_the_command_line() -> None:
     assert (changed.loss.world_model, changed.env.control_rate, changed.loss.discount) == ("informed", 50, 0.98)
 
 
-def test_what_races_from_images_alone_sees_no_state_in_training() -> None:
+def test_tuned_images_shows_no_network_the_state_in_training() -> None:
     """All else is as in `tuned=race`, and so are other settings that are asked for."""
     images, race = (compose("latent_ppo", f"tuned={name}") for name in ("images", "race"))
     assert (images.loss.world_model, images.loss.critic) == ("reconstruction", "latent")
@@ -221,13 +221,13 @@ def test_the_drift_penalty_needs_stored_latents_that_are_not_sampled(
     assert lines == ([] if reason is None else [f"policy drift penalty: off, because {reason}"])
 
 
-def test_what_races_goes_with_a_state_space_model() -> None:
+def test_tuned_race_works_with_a_state_space_model() -> None:
     gru, ssm = compose("dreamer_v3", "tuned=race"), compose("dreamer_v3", "tuned=race", "model=ssm_cpu_small")
     assert OmegaConf.to_container(gru) | {"model": None} == OmegaConf.to_container(ssm) | {"model": None}
     assert OmegaConf.to_container(gru.model) | {"size": "ssm_cpu_small"} == OmegaConf.to_container(ssm.model)
 
 
-def test_dreamer_as_published_is_one_word_away() -> None:
+def test_tuned_none_is_dreamer_as_published() -> None:
     """Every number of losses, model and schedule as in the reference, or as its size says."""
     faithful, schema = compose("dreamer_v3", "tuned=none"), recipe_module("composing.schema")
     assert OmegaConf.to_container(faithful.loss) == OmegaConf.to_container(OmegaConf.structured(schema.DreamerV3Losses))
@@ -255,7 +255,7 @@ def test_dreamer_as_published_is_one_word_away() -> None:
         (["env=dmc", "env.from_pixels=false"], "none"),
     ],
 )
-def test_what_learns_is_chosen_where_it_does(
+def test_tuned_auto_chooses_by_environment_budget_and_model(
     overrides: list[str], expected: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert recipe_module("composing.resolving").tune(compose("dreamer_v3", *overrides, "device=cpu")) == expected
@@ -291,7 +291,7 @@ def test_the_control_suite_is_evaluated_in_images_of_the_size_trained_on():
     evaluated.close()
 
 
-def test_what_goes_by_gates_passed_moves_with_them_and_not_with_the_run():
+def test_ramps_by_gates_follow_passed_gates_and_not_the_run():
     overrides = ["tuned=none", "model=debug", "device=cpu", "schedule.min_std.to=0.05", "schedule.min_std.begin=0.5"]
     overrides += ["schedule.min_std.end=0.7", "schedule.min_std.by=passes", "total_env_steps=100000"]
     config = OmegaConf.to_object(recipe_module("dreamer_v3").resolve(compose("dreamer_v3", *overrides)))
@@ -335,7 +335,7 @@ def test_what_the_chosen_losses_do_not_have_moves_only_if_it_is_asked_for():
     ]
 
 
-def test_nothing_goes_by_gates_where_there_are_none():
+def test_ramps_by_gates_are_refused_without_gates():
     overrides = ["env=dmc", "model=debug", "device=cpu", "schedule.discount.to=0.9", "schedule.discount.by=passes"]
     config = OmegaConf.to_object(recipe_module("dreamer_v3").resolve(compose("dreamer_v3", *overrides)))
     with pytest.raises(ValueError, match=r"schedule.discount.by=passes depends on gates, and env.suite=dmc has none"):
@@ -408,7 +408,7 @@ def test_a_run_that_is_refused_leaves_what_was_there_and_its_lock_to_the_next(
     assert (tmp_path / "log.txt").exists()
 
 
-def test_what_is_not_as_tuned_is_said_of_a_file_that_takes_another(capsys: pytest.CaptureFixture[str]) -> None:
+def test_settings_that_differ_from_a_derived_tuned_file_are_printed(capsys: pytest.CaptureFixture[str]) -> None:
     recipe = recipe_module("latent_ppo")
     recipe.resolve(compose("latent_ppo", "tuned=images", "device=cpu"))
     told = capsys.readouterr().out
@@ -425,7 +425,7 @@ def test_settings_are_said_of_the_algorithm_that_is_trained(capsys: pytest.Captu
     assert "settings: tuned=race, for DreamerV3 on races" in told and "latent PPO" not in told
 
 
-def test_what_is_not_as_tuned_is_said(capsys: pytest.CaptureFixture[str]) -> None:
+def test_settings_that_differ_from_tuned_are_printed(capsys: pytest.CaptureFixture[str]) -> None:
     """Nothing for the settings as they are; else each with what the file has, also of a group that it takes."""
     recipe = recipe_module("latent_ppo")
     recipe.resolve(compose("latent_ppo", "tuned=race", "track=kidney", "seed=3", "device=cpu"))

@@ -108,7 +108,7 @@ def test_what_hydra_refuses_is_said_in_plain_words(override: str, words: str) ->
         ("doctor", ["--json"]),
     ],
 )
-def test_what_is_a_setting_is_taken(recipe_name: str, taken: list[str]) -> None:
+def test_known_settings_are_accepted(recipe_name: str, taken: list[str]) -> None:
     recipe_module("composing.options").check_arguments(recipe_name, taken)
 
 
@@ -121,7 +121,7 @@ def test_what_is_a_setting_is_taken(recipe_name: str, taken: list[str]) -> None:
         (["-m", "--total-env-steps=9"], "--total-env-steps=9: settings are written without dashes, total_env_steps=9"),
     ],
 )
-def test_what_is_none_is_refused(overrides: list[str], words: str) -> None:
+def test_unknown_settings_are_refused(overrides: list[str], words: str) -> None:
     with pytest.raises(ValueError, match=words):
         recipe_module("composing.options").check_arguments("dreamer_v3", overrides)
 

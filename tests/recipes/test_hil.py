@@ -200,7 +200,7 @@ def test_what_is_believed_of_a_battery_must_be_what_can_be_reckoned_with():
         ({"implausible": 2}, "15.12 V at the end, from 9 readings, 2 implausible ones ignored"),
     ],
 )
-def test_what_was_heard_of_the_battery_is_said(changes, words):
+def test_battery_readings_are_reported(changes, words):
     battery = {"voltage_set": 15.8, "voltage": 15.12, "readings": 9, "implausible": 0, "last_reading_age_s": 0.1}
     assert hil.in_words(battery | changes) == f"battery: {words}"
 

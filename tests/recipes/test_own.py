@@ -204,7 +204,7 @@ def test_the_track_of_a_file_is_noted_when_a_run_begins(track: Track, tmp_path: 
     assert (built_in.saved_track(), built_in.track_description) == (load_track("kidney"), None)
 
 
-def test_what_a_run_notes_is_not_to_be_given() -> None:
+def test_track_description_cannot_be_given() -> None:
     checks = recipe_module("composing.checks")
     with pytest.raises(ValueError, match=r"track_description= is set by the run from its track file"):
         checks.check_overrides(compose("dreamer_v3"), ["track_description={}"])

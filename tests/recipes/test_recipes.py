@@ -228,7 +228,7 @@ def test_checkpoint_of_another_size_is_refused(run_dir: Path) -> None:
     assert "debug" in done.stderr and "cpu_small" in done.stderr
 
 
-def test_a_run_is_not_begun_over_another(run_dir: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_new_run_needs_its_own_directory(run_dir: Path, capsys: pytest.CaptureFixture[str]) -> None:
     before = sorted((run_dir / "checkpoints").iterdir())
     with pytest.raises(SystemExit):
         build(f"run_dir='{run_dir}'")
@@ -298,7 +298,7 @@ def test_a_kill_while_a_run_is_continued_leaves_its_configuration_whole(
             assert (place.read_text() == before[place]) == (index >= written), place
 
 
-def test_what_is_no_whole_run_is_not_continued(run_dir: Path, tmp_path: Path) -> None:
+def test_an_incomplete_run_is_not_resumed(run_dir: Path, tmp_path: Path) -> None:
     resumed = recipe_module("composing.launching").resumed_config
     with pytest.raises(ValueError, match=r"networks of a run's best evaluation: set resume=.*first läuf .*b\)\."):
         resumed("dreamer_v3", str(run_dir / "best"), [])

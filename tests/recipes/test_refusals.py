@@ -174,7 +174,7 @@ def test_what_would_be_ignored_is_refused(overrides: list[str], words: str) -> N
         (["schedule.wait_every=9"], "wait_every=9 is for schedule.wait_for_model, which is not chosen"),
     ],
 )
-def test_what_nothing_would_read_is_refused(overrides: list[str], words: str) -> None:
+def test_settings_that_nothing_reads_are_refused(overrides: list[str], words: str) -> None:
     config = compose(taker(overrides), *overrides)
     with pytest.raises(ValueError, match=words):
         recipe_module("composing.checks").check_read(config, overrides)
@@ -210,7 +210,7 @@ def test_a_setting_of_another_algorithm_is_refused_with_the_recipe_that_takes_it
         ["loss.actor=mine:objective", "loss.world_model=mine:Mine", "loss.image_scale=9", "loss.barlow_scale=9"],
     ],
 )
-def test_what_is_read_or_left_out_or_may_be_read_passes(
+def test_settings_that_are_read_or_not_given_are_accepted(
     overrides: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     own = "from dreamer_racing.losses import State, reinforce as objective\n\n\nclass Mine(State):\n    pass\n"

@@ -81,7 +81,7 @@ def test_help_loads_neither_torch_nor_hydra(name: str, flag: str, tmp_path: Path
         ("fly", "+agnt=kidney", "there is no such setting of recipes/fly.py (did you mean agent?)"),
     ],
 )
-def test_a_slip_of_the_pen_ends_in_a_line_before_anything_is_loaded(
+def test_a_typing_error_ends_in_a_line_before_anything_is_loaded(
     name: str, override: str, words: str, tmp_path: Path
 ) -> None:
     done = recipe(name, override, cwd=tmp_path, before=WHAT_IS_LOADED)

@@ -72,7 +72,7 @@ def test_the_latest_evaluation_is_that_of_the_deterministic_policy(tmp_path: Pat
     assert run.latest_evaluation() == "1000000064"
 
 
-def test_evaluations_of_after_where_a_run_goes_on_step_aside(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+def test_evaluations_after_the_resumed_env_steps_move(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     run = RunDirectory(tmp_path)
     for folder, ending in ((run.evaluations, "_stochastic_trajectory.csv"), (run.plots, ".png"), (run.videos, ".mp4")):
         folder.mkdir()
@@ -100,7 +100,7 @@ def test_a_damaged_line_of_the_history_is_left_out(tmp_path: Path, caplog: pytes
 
 
 @pytest.mark.parametrize("call", ["fsync", "replace"])
-def test_a_file_is_as_it_was_or_as_it_is_to_be(call: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_file_is_replaced_whole_or_not_at_all(call: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     path = tmp_path / "config.yaml"
     replace_text(path, "old")
 
@@ -169,7 +169,7 @@ def test_an_abandoned_folder_stays_if_it_was_there_or_was_written_to(written: st
     directory.claim().release()  # the next one gets it
 
 
-def test_what_cannot_be_taken_away_stays_and_is_let_go(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_folder_that_cannot_be_removed_is_unlocked(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     directory = RunDirectory(tmp_path / "run")
     lock = directory.claim()
     with monkeypatch.context() as patch:
