@@ -124,28 +124,28 @@ class DroneRaceVectorEnv(VectorEnv[Observation, np.ndarray, np.ndarray]):
             ResetNeeded: in mode DISABLED, an ended episode has not been reset.
             ValueError: wrong shape.
         """
-        begun = self._ended
-        if begun.any() and self.autoreset_mode is AutoresetMode.DISABLED:
-            where = begun.nonzero()[0].tolist()
+        reset_now = self._ended
+        if reset_now.any() and self.autoreset_mode is AutoresetMode.DISABLED:
+            where = reset_now.nonzero()[0].tolist()
             raise gymnasium.error.ResetNeeded(f"Episodes {where} have ended: reset them by a reset_mask before step().")
         outcome, reward = self.race.step(actions)
-        if begun.any():
-            self.race.begin(begun)
-        terminated = outcome.terminated.numpy() & ~begun
-        truncated = outcome.truncated.numpy() & ~begun
+        if reset_now.any():
+            self.race.begin(reset_now)
+        terminated = outcome.terminated.numpy() & ~reset_now
+        truncated = outcome.truncated.numpy() & ~reset_now
         ended = terminated | truncated
-        told = self.race.info(outcome, begun)
-        info = self._masked(told)
+        step_info = self.race.info(outcome, reset_now)
+        info = self._masked(step_info)
         observation = self.race.observe()
         if self.autoreset_mode is AutoresetMode.SAME_STEP and ended.any():
             info |= self._final(observation, ended)
-            info |= {"final_info": self._masked(told, ended), "_final_info": ended}
+            info |= {"final_info": self._masked(step_info, ended), "_final_info": ended}
             self.race.begin(ended)
             info |= self._masked(self.race.info(outcome, ended))
             observation = with_rows(observation, ended, self.race.observe(ended))
             ended = np.zeros_like(ended)
         self._ended = ended
-        return observation, np.where(begun, 0.0, reward), terminated, truncated, info
+        return observation, np.where(reset_now, 0.0, reward), terminated, truncated, info
 
     def render(self) -> tuple[np.ndarray, ...] | None:
         """Return the chase or onboard views, N images uint8 (256, 256, 3); None without a render mode."""

@@ -76,7 +76,7 @@ class RaceWindow:
         with self._viewer.lock():
             self._data.qpos[:] = *state["position"], *state["attitude"]
             mujoco.mj_forward(self._model, self._data)
-        self._viewer.set_texts((None, mujoco.mjtGridPos.mjGRID_TOPLEFT, *self._words(tensordict)))
+        self._viewer.set_texts((None, mujoco.mjtGridPos.mjGRID_TOPLEFT, *self._overlay_text(tensordict)))
         images = tensordict.get("pixels", None)
         if images is not None:
             self._refuse_closed()  # again: asking a closed window for its size is a segmentation fault
@@ -95,7 +95,7 @@ class RaceWindow:
         if not self._viewer.is_running():
             raise WindowClosedError
 
-    def _words(self, tensordict: TensorDictBase) -> tuple[str, str]:
+    def _overlay_text(self, tensordict: TensorDictBase) -> tuple[str, str]:
         """Return names and values of the overlay text, one line each."""
         gates, lap = self._track.num_gates, int(tensordict["race", "gates_passed"]) // self._track.num_gates + 1
         rows = {

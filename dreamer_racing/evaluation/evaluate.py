@@ -297,7 +297,7 @@ def evaluate(
             acted = policy(tensordict)
             value = value_function(acted[:recorded]) if value_function and recorder.running else None
             tensordict, following = env.step_and_maybe_reset(acted)
-            action, action_before = _as_flown(tensordict["action"]), action
+            action, action_before = _applied_action(tensordict["action"]), action
             change = (action - action_before).norm(dim=-1, keepdim=True)
             steps = _read_step(tensordict["next"], change, env.worlds.effort)
             before = sum(map(len, flown))
@@ -338,7 +338,7 @@ def _check(env: EnvBase, episodes: int) -> float:
     return float(env.worlds.parameters.control_dt)
 
 
-def _as_flown(action: Tensor) -> Tensor:
+def _applied_action(action: Tensor) -> Tensor:
     """Return actions (N, A) as the environment applies them: clipped, and zero for non-finite entries."""
     return action.float().nan_to_num(0.0, 0.0, 0.0).clamp(-1.0, 1.0)
 

@@ -32,7 +32,7 @@ def world_model_metrics(learner: WorldModelLearner, batch: TensorDictBase) -> di
     Returns:
         Losses and metrics of the world-model loss, scalars on the learner's device.
     """
-    with _untouched(learner):
+    with _preserved_random_state(learner):
         losses, _ = learner.world_model_loss(batch.to(learner.device))
     return losses
 
@@ -66,12 +66,12 @@ def held_out_metrics(learner: WorldModelLearner, batch: TensorDictBase) -> dict[
     horizon = learner.config.imagination_horizon  # constant over a run, even if the horizon is scheduled
     if batch.shape[1] < SEEN + horizon:
         raise ValueError(f"Windows of {batch.shape[1]} records: {SEEN} + horizon {horizon} are needed.")
-    with _untouched(learner):
+    with _preserved_random_state(learner):
         return _measure(learner, batch.to(learner.device)[:, : SEEN + horizon], horizon)
 
 
 @contextmanager
-def _untouched(learner: WorldModelLearner) -> Iterator[None]:
+def _preserved_random_state(learner: WorldModelLearner) -> Iterator[None]:
     """Return a context with the autocast of updates that restores the random state on exit."""
     devices = [learner.device] if learner.device.type == "cuda" else []
     with torch.random.fork_rng(devices=devices), learner.autocast():

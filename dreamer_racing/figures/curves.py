@@ -105,11 +105,11 @@ def wanted_columns(quantities: Sequence[str], axis: str = "env_steps") -> list[s
         if name not in QUANTITIES:
             raise ValueError(f"quantities={name}: must be one of {', '.join(QUANTITIES)}.")
     columns = [QUANTITIES[name].column for name in quantities]
-    beside = [name for column in columns for name in _presence(column)]
+    beside = [name for column in columns for name in _evaluation_markers(column)]
     return [*dict.fromkeys([*columns, *beside, WEIGHT, *([clock] if clock else [])])]
 
 
-def _presence(column: str) -> list[str]:
+def _evaluation_markers(column: str) -> list[str]:
     """Return the columns that mark the rows of evaluations, if the column is of evaluations; else none."""
     prefix = column.partition("/")[0]
     return [f"{prefix}/{name}" for name in PRESENCE] if prefix.startswith("evaluation") else []
@@ -202,7 +202,7 @@ def measurements(run: RunData, column: str) -> tuple[np.ndarray, np.ndarray]:
     """
     columns = run.metrics.columns
     steps, values = columns.get(column, (np.empty(0), np.empty(0)))
-    evaluated = [columns[name][0] for name in _presence(column) if name in columns]
+    evaluated = [columns[name][0] for name in _evaluation_markers(column) if name in columns]
     without = np.setdiff1d(np.concatenate([*evaluated, np.empty(0)]), steps)
     order = np.argsort(np.concatenate((steps, without)), kind="stable")
     filled = np.concatenate((values, np.full(len(without), np.nan)))
@@ -285,7 +285,7 @@ def bootstrap_interval(
     return np.percentile(statistic(np.concatenate(pooled)), (2.5, 97.5), axis=0)  # of (D, P)
 
 
-def _deviation(strata: Sequence[np.ndarray]) -> np.ndarray:
+def _deviation_band(strata: Sequence[np.ndarray]) -> np.ndarray:
     pooled = np.concatenate(strata)
     return pooled.mean(0) + np.array([[-1.0], [1.0]]) * pooled.std(0, ddof=1)
 
@@ -294,7 +294,7 @@ def _mean(scores: np.ndarray) -> np.ndarray:
     return scores.mean(0)
 
 
-AGGREGATES = {"mean": (_mean, _deviation), "iqm": (interquartile_mean, bootstrap_interval)}
+AGGREGATES = {"mean": (_mean, _deviation_band), "iqm": (interquartile_mean, bootstrap_interval)}
 """Functions for the centre, from runs (S, P), and for the band (2, P), from runs by track."""
 
 

@@ -80,7 +80,7 @@ def panel(track: Track, flights: Sequence[ShownFlight], training: Sequence[str])
         f"<header><h1>{escape(track.name)}</h1>{_legend(shown)}</header>",
         f'<section class="views">{_views(shown)}{_state(track, shown)}</section>',
         f'<section class="curves">{"".join(_curves(shown))}<i class="cursor"></i></section>',
-        f"<footer>{''.join(f'<p>{_with_commands(line)}</p>' for line in lines)}</footer>",
+        f"<footer>{''.join(f'<p>{_with_code_elements(line)}</p>' for line in lines)}</footer>",
     )
     return f'<aside class="dashboard">{"".join(parts)}</aside>'
 
@@ -247,7 +247,7 @@ def _points(values: np.ndarray, step: float, low: float, high: float) -> Iterato
             yield " ".join(f"{x:.1f},{y:.1f}" for x, y in zip(place[part], level[part], strict=True))
 
 
-def _with_commands(line: str) -> str:
+def _with_code_elements(line: str) -> str:
     """Convert text between backquotes to HTML code elements."""
     parts = escape(line).split("`")
     return "".join(f"<code>{part}</code>" if index % 2 else part for index, part in enumerate(parts))

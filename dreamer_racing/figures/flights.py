@@ -73,7 +73,7 @@ def plot_flights(
         raise ValueError(f"over={over}: must be one of {', '.join(PROFILE_AXES)}.")
     columns = min(columns, len(flights))
     rows = math.ceil(len(flights) / columns)
-    half = [max(size) / 2 for size in zip(*(_hall(flight.track) for flight in flights), strict=True)]  # m
+    half = [max(size) / 2 for size in zip(*(_floor_size(flight.track) for flight in flights), strict=True)]  # m
     top = 4.4 * half[1] / half[0]  # inches
     width, height = 4.6 * columns + 0.7, rows * (top + 2 * PROFILE_HEIGHT + 0.9) + 0.5 + TITLE_ROOM
     figure = Figure(figsize=(width, height))
@@ -114,7 +114,7 @@ def _draw_flight_and_profiles(
     altitude.set_xlabel("")
 
 
-def _hall(track: Track) -> tuple[float, float]:
+def _floor_size(track: Track) -> tuple[float, float]:
     """Return width and depth of a track's bounding box, m."""
     (x_low, y_low, _), (x_high, y_high, _) = track.bounds_low, track.bounds_high
     return x_high - x_low, y_high - y_low

@@ -208,7 +208,7 @@ def _draw_tracking(
         axes.step(asked_time - began, asked, where="post", color=ASKED_COLOR, linewidth=0.9, label="commanded")
         axes.plot(time - began, measured, color=MEASURED_COLOR, linewidth=1.2, alpha=0.85, label="measured")
         axes.set_ylabel(LABELS[name], fontsize=8)
-        axes.set_title(_error_in_words(name, errors[name]), loc="left", fontsize=8, color=MUTED)
+        axes.set_title(_error_text(name, errors[name]), loc="left", fontsize=8, color=MUTED)
         dress(axes)
     figure.align_ylabels(panels)
     panels[-1].set_xlabel("time since arming (s); thrust is measured from velocities and includes drag")
@@ -217,7 +217,7 @@ def _draw_tracking(
     save(figure, path)
 
 
-def _error_in_words(name: str, error: dict[str, float | None] | None) -> str:
+def _error_text(name: str, error: dict[str, float | None] | None) -> str:
     if error is None:
         return "too few measurements for an error"
     lag = "no lag, as the command is constant" if error["lag_ms"] is None else f"at a lag of {error['lag_ms']:.0f} ms"
@@ -238,7 +238,7 @@ def _lines(report: dict[str, Any]) -> list[str]:
     middle = f", {np.mean(offsets):.2f} m from the centre on average, {max(offsets):.2f} m at most" if offsets else ""
     lines.append(f"gates passed: {len(offsets)}{middle}")
     lines += [f"laps ({name}): {_seconds(laps)}" for name, laps in report["laps_s"].items() if laps]
-    lines += [f"{name}: {_error_in_words(name, error)}" for name, error in report["tracking"].items() if error]
+    lines += [f"{name}: {_error_text(name, error)}" for name, error in report["tracking"].items() if error]
     lines += [
         f"{name}: up to {flight['speed_max']:.1f} m/s, {flight['speed_mean']:.1f} on average, "
         f"{flight['gates']} gates in {flight['duration_s']:.2f} s"

@@ -231,11 +231,11 @@ def tracking_error(response: Response) -> dict[str, float | None] | None:
     time, measured = response.time[usable], response.measured[usable]
     if len(time) < FEWEST:
         return None
-    without = _rms(measured - _held(response, time))
-    if np.ptp(_held(response, time)) < 1e-9:
+    without = _rms(measured - _commands_at(response, time))
+    if np.ptp(_commands_at(response, time)) < 1e-9:
         return {"rms": without, "lag_ms": None, "rms_without_lag": without}
     lags = np.arange(round(LAG_MAX / LAG_STEP) + 1) * LAG_STEP
-    rms = np.array([_rms(measured - _held(response, time - lag)) for lag in lags])
+    rms = np.array([_rms(measured - _commands_at(response, time - lag)) for lag in lags])
     best = lags[np.isclose(rms, rms.min(), rtol=1e-9, atol=1e-12)]
     return {"rms": float(rms.min()), "lag_ms": 1e3 * float(best[len(best) // 2]), "rms_without_lag": without}
 
@@ -244,7 +244,7 @@ def _rms(values: np.ndarray) -> float:
     return float(np.sqrt(np.mean(values**2)))
 
 
-def _held(response: Response, time: np.ndarray) -> np.ndarray:
+def _commands_at(response: Response, time: np.ndarray) -> np.ndarray:
     """Return the commands in force at times (M,), (M,)."""
     return response.asked[np.searchsorted(response.asked_time, time + 1e-9, side="right") - 1]
 

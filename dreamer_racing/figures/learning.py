@@ -112,7 +112,7 @@ def _end(curves: LearningCurves, track: str) -> float:
 def _draw_panel(axes: Axes, curves: Sequence[Curve], styles: Styles, end: float) -> None:
     for curve in sorted(curves, key=lambda curve: _rank(curve.key), reverse=True):  # the reference on top
         line = styles[curve.key._replace(track="")]
-        if curve.key.is_reference or not _crowded(curve.key, styles):
+        if curve.key.is_reference or not _has_many_variants(curve.key, styles):
             ends = (0.0, 1.0) if QUANTITIES[curve.quantity].comparable else (-np.inf, np.inf)  # rates are in [0, 1]
             band = (np.clip(side, *ends) for side in (curve.low, curve.high))
             axes.fill_between(curve.x, *band, color=line["color"], alpha=0.18, linewidth=0)
@@ -170,7 +170,7 @@ def _draw_legend(axes: Axes, handles: Sequence[Line2D], caption: str, columns: i
 def _caption(curves: LearningCurves, styles: Styles) -> str:
     """Return a caption that names the aggregate, the band and the window."""
     centre, band = BANDS[curves.aggregate]
-    of = " of the default only" if any(_crowded(key, styles) for key in styles) else ""
+    of = " of the default only" if any(_has_many_variants(key, styles) for key in styles) else ""
     window = f"{curves.window:.2g}"
     if not axis_of(curves.axis).clock:
         window = EngFormatter(sep="")(float(window))  # 24k, 1.5M
@@ -232,11 +232,11 @@ def _line_style(key: CurveKey, own: Sequence[CurveKey]) -> dict[str, Any]:
     color = np.array(to_rgb(ALGORITHMS.get(key.algorithm, ("", MUTED))[1]))
     shade = VARIANT_SHADES[(index + index // lines) % shades]  # shifted after each cycle of dashes
     mixed = color * (1 + shade) if shade < 0 else color + (1 - color) * shade
-    thin = _crowded(key, own) and not key.is_reference
+    thin = _has_many_variants(key, own) and not key.is_reference
     return {"color": tuple(mixed), "linestyle": VARIANT_LINES[index % lines], "linewidth": 1.2 if thin else 1.9}
 
 
-def _crowded(key: CurveKey, keys: Collection[CurveKey]) -> bool:
+def _has_many_variants(key: CurveKey, keys: Collection[CurveKey]) -> bool:
     return sum(other.algorithm == key.algorithm for other in keys) > MANY_VARIANTS
 
 

@@ -65,12 +65,12 @@ class EvaluationReport:
         Returns:
             Metrics `evaluation/...`, and `evaluation_stochastic/...` if ``stochastic``.
         """
-        metrics = self._one(f"{env_steps:09d}", "evaluation", deterministic=True)
+        metrics = self._report_policy(f"{env_steps:09d}", "evaluation", deterministic=True)
         if stochastic:
-            metrics |= self._one(f"{env_steps:09d}_stochastic", "evaluation_stochastic", deterministic=False)
+            metrics |= self._report_policy(f"{env_steps:09d}_stochastic", "evaluation_stochastic", deterministic=False)
         return metrics
 
-    def _one(self, name: str, prefix: str, deterministic: bool) -> dict[str, float]:
+    def _report_policy(self, name: str, prefix: str, deterministic: bool) -> dict[str, float]:
         result = self.evaluate(deterministic)
         with self.attempt("evaluations, plots and videos"):
             self.write(name, result)

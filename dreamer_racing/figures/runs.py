@@ -212,10 +212,10 @@ def read_runs(directories: Sequence[Path], wanted: Collection[str] | None = None
         else:
             runs.append(run)
             problems += [f"{directory.name}: {problem}" for problem in run.metrics.problems]
-    return _once_each(runs, problems), problems
+    return _one_run_per_seed(runs, problems), problems
 
 
-def _once_each(runs: Sequence[RunData], problems: list[str]) -> list[RunData]:
+def _one_run_per_seed(runs: Sequence[RunData], problems: list[str]) -> list[RunData]:
     """Keep one run per seed of each curve, because a repetition is not an independent sample."""
     kept = []
     for group in _by_curve(runs).values():
@@ -246,10 +246,10 @@ def _read_config(directory: Path) -> dict[str, Any]:
 def _read_overrides(directory: Path) -> dict[str, str]:
     """Read the settings of the command line; they only name curves, so that they may be missing."""
     try:
-        told = yaml.safe_load(RunDirectory(directory).overrides.read_text(encoding="utf-8"))
+        overrides = yaml.safe_load(RunDirectory(directory).overrides.read_text(encoding="utf-8"))
     except (OSError, yaml.YAMLError, UnicodeDecodeError):
         return {}
-    pairs = (str(item).lstrip("+~").partition("=") for item in (told if isinstance(told, list) else ()))
+    pairs = (str(item).lstrip("+~").partition("=") for item in (overrides if isinstance(overrides, list) else ()))
     return {name: value for name, _, value in pairs}
 
 
@@ -325,7 +325,7 @@ def _by_curve(runs: Sequence[RunData]) -> dict[CurveKey, list[RunData]]:
     groups = {}
     for key, group in named.items():
         parts = _split_by_settings(group)
-        for label, part in zip(_differences(parts), parts, strict=True):
+        for label, part in zip(_difference_labels(parts), parts, strict=True):
             groups[key._replace(variant=" ".join(filter(None, (key.variant, label))))] = part
     return dict(sorted(groups.items()))
 
@@ -334,7 +334,7 @@ def _split_by_settings(runs: Sequence[RunData]) -> list[list[RunData]]:
     """Split runs into parts with equal settings: each run joins the first part that it equals."""
     parts: list[list[RunData]] = []
     for run in runs:
-        like = (part for part in parts if not any(_different(run.config, other.config) for other in part))
+        like = (part for part in parts if not any(_differing_settings(run.config, other.config) for other in part))
         if (part := next(like, None)) is None:
             parts.append([run])
         else:
@@ -342,33 +342,33 @@ def _split_by_settings(runs: Sequence[RunData]) -> list[list[RunData]]:
     return parts
 
 
-def _different(first: Mapping[str, Any], second: Mapping[str, Any]) -> list[str]:
+def _differing_settings(first: Mapping[str, Any], second: Mapping[str, Any]) -> list[str]:
     """Return the names of settings that affect learning and differ between two configurations that both have them."""
     common = first.keys() & second.keys()
     return sorted(name for name in common if not name.startswith(SAME_CURVE) and first[name] != second[name])
 
 
-def _differences(parts: Sequence[Sequence[RunData]]) -> list[str]:
+def _difference_labels(parts: Sequence[Sequence[RunData]]) -> list[str]:
     """Return a label per part that names its differing settings; empty for a single part."""
     if len(parts) == 1:
         return [""]
-    told = [_of_learning(part[0].overrides) for part in parts]
-    names = {name for one in told for name in one if any(other.get(name) != one[name] for other in told)}
-    labels = _name_by(told, sorted(names))
+    overrides = [_relevant(part[0].overrides) for part in parts]
+    names = {name for one in overrides for name in one if any(other.get(name) != one[name] for other in overrides)}
+    labels = _name_by(overrides, sorted(names))
     if len(set(labels)) == len(labels):
         return labels
     # The overrides do not differ (for instance between versions): use the settings of all runs of a part.
-    configs = [_of_learning({name: value for run in part for name, value in run.config.items()}) for part in parts]
+    configs = [_relevant({name: value for run in part for name, value in run.config.items()}) for part in parts]
     pairs = combinations(configs, 2)
-    different = sorted({name for first, second in pairs for name in _different(first, second)})
+    different = sorted({name for first, second in pairs for name in _differing_settings(first, second)})
     counts = range(1, len(different) + 1)
-    if (enough := next((n for n in counts if _tells_apart(configs, different[:n])), None)) is None:
+    if (enough := next((n for n in counts if _labels_are_unique(configs, different[:n])), None)) is None:
         return [f"({number})" for number in range(1, len(parts) + 1)]  # they differ only in settings of every key
     more = ", …" if enough < len(different) else ""
     return [f"{label}{more}" for label in _name_by(configs, different[:enough])]
 
 
-def _of_learning(settings: Mapping[str, Any]) -> dict[str, Any]:
+def _relevant(settings: Mapping[str, Any]) -> dict[str, Any]:
     return {name: value for name, value in settings.items() if name not in IN_KEY and not name.startswith(SAME_CURVE)}
 
 
@@ -376,5 +376,5 @@ def _name_by(settings: Sequence[Mapping[str, Any]], names: Sequence[str]) -> lis
     return [", ".join(f"{name}={one[name]}" for name in names if name in one) for one in settings]
 
 
-def _tells_apart(settings: Sequence[Mapping[str, Any]], names: Sequence[str]) -> bool:
+def _labels_are_unique(settings: Sequence[Mapping[str, Any]], names: Sequence[str]) -> bool:
     return len(set(_name_by(settings, names))) == len(settings)

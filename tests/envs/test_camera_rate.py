@@ -109,7 +109,7 @@ def test_state_dict_goes_on_with_the_frame_that_is_shown() -> None:
         each.close()
 
 
-def test_every_front_door_shows_the_same() -> None:
+def test_every_interface_gives_the_same_frames() -> None:
     expected = held(flown(1))[:, 0].numpy()
     options = {**OPTIONS, "camera_rate": 25.0}
 
@@ -174,7 +174,7 @@ def test_other_rates_are_refused(camera_rate: object, words: str) -> None:
         load("circle", from_pixels=True, camera_rate=camera_rate)
 
 
-def test_without_images_there_is_no_rate_of_them() -> None:
+def test_a_camera_rate_without_images_is_refused() -> None:
     for make in (DroneRacingEnv, load):
         with pytest.raises(ValueError, match="camera_rate=25: needs images, but from_pixels=False"):
             make("circle", from_pixels=False, camera_rate=25)

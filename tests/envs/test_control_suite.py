@@ -322,7 +322,7 @@ def test_resume_before_the_first_episode() -> None:
     assert torch.equal(env.reset()["vector"], resumed.reset()["vector"])
 
 
-def test_foreign_state_is_refused() -> None:
+def test_state_of_another_task_is_refused() -> None:
     state = blind(num_envs=2).state_dict()
     with pytest.raises(ValueError, match="has 2 world.* of cartpole_swingup, but this environment has 3 of walker"):
         blind("walker_walk", 3).load_state_dict(state)

@@ -30,12 +30,12 @@ ENVIRONMENTS: dict[str, Callable[[], Any]] = {
 
 @pytest.mark.parametrize("way", [copy.deepcopy, pickle.dumps], ids=["deepcopy", "pickle"])
 @pytest.mark.parametrize("name", ENVIRONMENTS)
-def test_a_race_is_refused_in_words(name: str, way: Callable[[Any], Any]) -> None:
+def test_copying_a_race_is_refused(name: str, way: Callable[[Any], Any]) -> None:
     with pytest.raises(TypeError, match=r"cannot be copied or pickled: make (another|new ones)"):
         way(ENVIRONMENTS[name]())
 
 
-def test_so_is_the_copy_that_dm_control_offers() -> None:
+def test_a_copy_of_dm_controls_physics_is_refused() -> None:
     with pytest.raises(TypeError, match="cannot be copied or pickled: make another by load"):
         load("circle", random=0).physics.copy()
 

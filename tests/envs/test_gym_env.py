@@ -81,7 +81,7 @@ def test_an_unknown_argument_is_refused_by_the_class_that_was_asked_for(make: Ca
         make(IDS[0], from_pixels=False)
 
 
-def test_words_for_yes_and_no_are_refused() -> None:
+def test_other_values_than_booleans_are_refused() -> None:
     with pytest.raises(
         TypeError, match=r"^DroneRacingEnv got an unexpected keyword argument 'trak' \(did you mean track\?\)"
     ):
@@ -233,7 +233,7 @@ def test_action_that_is_not_finite_ends_the_single_environment() -> None:
 
 
 @pytest.mark.parametrize("kind", [int, bool, complex])
-def test_actions_that_are_no_fractions_are_refused(kind: type) -> None:
+def test_actions_that_are_no_floats_are_refused(kind: type) -> None:
     env = DroneRaceGymEnv("circle", observation="state")
     env.reset()
     with pytest.raises(TypeError, match=r"Action of \w+: thrust and body rates are floating-point"):
@@ -290,7 +290,7 @@ def test_wrong_arguments_are_explained() -> None:
         (None, "device='None': must be cpu or cuda"),
     ],
 )
-def test_devices_without_worlds_are_refused(device: str | None, words: str) -> None:
+def test_unsupported_devices_are_refused(device: str | None, words: str) -> None:
     with pytest.raises(ValueError, match=words):
         DroneRaceGymEnv("circle", observation="state", device=device)
 

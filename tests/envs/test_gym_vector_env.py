@@ -16,7 +16,7 @@ from tests.envs.test_gym_env import HOVER, IDS, INFO, make_vec
 CLIMB = np.array([0.5, 0.0, 0.0, 0.0], np.float32)
 
 
-def test_a_part_cannot_begin_before_all_have() -> None:
+def test_a_partial_reset_needs_a_full_reset_first() -> None:
     envs = make_vec(observation="state", autoreset_mode="Disabled")
     part = {"reset_mask": np.array([True, False, False])}
     with pytest.raises(gymnasium.error.ResetNeeded, match=r"covers only 1 of 3 episodes: first reset all of them"):

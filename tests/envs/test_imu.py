@@ -129,7 +129,7 @@ def flown(env: DroneRacingEnv, steps: int) -> Tensor:
     return torch.stack(seen)
 
 
-def test_every_front_door_shows_the_same() -> None:
+def test_every_interface_gives_the_same_imu() -> None:
     env = DroneRacingEnv("circle", 1, preset="faithful", imu="exact", privileged=False, **SMALL)
     check_env_specs(env)
     env.set_seed(3)
@@ -194,7 +194,7 @@ def test_the_worlds_are_those_without_and_go_on_from_a_state() -> None:
         env.close()
 
 
-def test_who_flies_on_feels_no_reset_of_another() -> None:
+def test_a_reset_does_not_affect_the_other_environments() -> None:
     env = DroneRacingEnv("circle", 2, imu="noisy", **SMALL)
     flown(env, 3)
     data = env.step(env.fake_tensordict().set("action", torch.zeros(2, 4)))["next"].exclude("reward")
@@ -225,6 +225,6 @@ def test_bad_values_are_refused(arguments: dict, words: str) -> None:
         gymnasium.make("dreamer_racing/Circle-v0", imu="exact")
 
 
-def test_the_named_ones_are_what_they_are_called() -> None:
+def test_named_imus_have_the_errors_of_their_name() -> None:
     assert IMUS["exact"] == ImuErrors()
     assert all(value > 0 for value in vars(IMUS["noisy"]).values())

@@ -90,7 +90,7 @@ def test_a_step_says_where_it_led_and_what_came_of_it() -> None:
     assert torch.equal(last.position, worlds.privileged()["position"])
 
 
-def test_what_broke_is_given_as_zeros() -> None:
+def test_non_finite_states_are_given_as_zeros() -> None:
     worlds, _ = fly(reward=lambda step: step.after.position.sum(-1))
     worlds.simulator.state.position[1] = torch.nan
     assert worlds.race_state().position[1].eq(0).all()
@@ -174,7 +174,7 @@ def uneven() -> Any:
         ({"vector": OWN["gate_and_action"], "imu": "exact", "from_pixels": True}, "imu= and vector= cannot be"),
     ],
 )  # fmt: skip
-def test_bad_ones_are_refused(own: dict[str, Any], message: str) -> None:
+def test_bad_functions_are_refused(own: dict[str, Any], message: str) -> None:
     def use() -> None:
         env = DroneRacingEnv("circle", **SMALL | own)
         env.rollout(2)

@@ -244,7 +244,7 @@ def test_wrong_action_shape_is_explained() -> None:
 
 
 @pytest.mark.parametrize("kind", [torch.int64, torch.bool, torch.complex64])
-def test_actions_that_are_no_fractions_are_refused(kind: torch.dtype) -> None:
+def test_actions_that_are_no_floats_are_refused(kind: torch.dtype) -> None:
     env = blind()
     data = env.reset()
     with pytest.raises(TypeError, match=f"Action of {kind}: thrust and body rates are floating-point numbers"):

@@ -277,7 +277,7 @@ def flown(worlds: RaceWorlds, steps: int) -> tuple[torch.Tensor, torch.Tensor, t
     return vector, images, gate
 
 
-def test_who_believes_the_truth_sees_what_the_camera_saw() -> None:
+def test_the_view_of_the_true_state_equals_the_camera_image() -> None:
     """Latents that are the race vector, over more frames than there are worlds; the drones stay where they are."""
     worlds = RaceWorlds("kidney", num_envs=3, start_on_line=1.0)
     vector, images, gate = flown(worlds, 4)
@@ -295,7 +295,7 @@ def test_who_believes_the_truth_sees_what_the_camera_saw() -> None:
     worlds.close()
 
 
-def test_a_model_that_believes_nonsense_is_shown_all_the_same() -> None:
+def test_the_view_of_an_impossible_state_has_an_image() -> None:
     worlds = RaceWorlds("kidney", num_envs=2)
     painter = BelievedView(torch.nn.Identity(), worlds)
     for nonsense in (torch.nan, torch.inf, 1e30, 0.0):

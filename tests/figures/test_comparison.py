@@ -181,12 +181,12 @@ def test_where_no_lap_was_flown_the_axis_is_not_negative(drawn):
     assert [tick.get_text() for tick in laps.get_xticklabels()] == ["0"]
 
 
-def test_no_study_is_left_out_in_silence():
+def test_too_many_studies_are_refused():
     studies = [result(str(number), [flight("mass", 1.0, 4.0)]) for number in range(len(COLORS) + 1)]
     with pytest.raises(ValueError, match="5 studies: at most 4"):
         plot_study(studies, "study.png")
 
 
-def test_nothing_flown_is_said(tmp_path):
+def test_studies_without_flights_are_refused(tmp_path):
     with pytest.raises(ValueError, match="hold no flight"):
         plot_study([result("pilot", [])], tmp_path / "study.png")

@@ -379,7 +379,7 @@ def test_unreadable_runs_are_named_and_left_out(tmp_path, spoil, words):
     assert problem.startswith("dreamer_v3_circle_seed1 left out: ") and words in problem
 
 
-def test_nothing_left_is_refused_with_the_reasons(tmp_path):
+def test_no_run_to_draw_is_refused_with_the_reasons(tmp_path):
     (write_run(tmp_path, "lonely") / "metrics.csv").unlink()
     with pytest.raises(ValueError, match="no run to draw. lonely left out: it has no metrics.csv"):
         curves_of(tmp_path)

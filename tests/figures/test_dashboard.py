@@ -96,7 +96,7 @@ def test_numbers_are_those_of_the_flight_in_si_units():
     assert said["words"][-1] == ["2/3", "1/4", "gate frame"]
 
 
-def test_a_lost_state_is_said_and_breaks_no_curve():
+def test_a_non_finite_state_is_drawn_as_a_gap():
     flight = circling()
     flight.position[-1], flight.linear_velocity[-1] = torch.nan, torch.nan
     assert readings(CIRCLE, shown(flight))["flights"][0]["values"]["speed"][-1] is None

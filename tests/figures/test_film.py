@@ -248,7 +248,7 @@ def test_a_line_fits_into_its_strip(width, right):
     assert written.any() and not written[-2:].any()
 
 
-def test_flights_of_the_young_are_slowed():
+def test_short_flights_are_slowed():
     assert [slow_motion(seconds) for seconds in (12.0, 4.0, 1.5, 0.1, 0.0)] == [1, 1, 3, 8, 8]
 
 
@@ -357,7 +357,7 @@ def test_beside_it_stands_what_the_drone_sees() -> None:
     view.close()
 
 
-def test_a_flight_that_ends_with_numbers_that_are_none_is_filmed_as_far_as_it_goes() -> None:
+def test_a_flight_is_filmed_up_to_its_first_non_finite_state() -> None:
     trajectory = flight_of(3)
     trajectory.position[1:] = torch.nan
     view = view_of_circle(size=32)

@@ -97,7 +97,7 @@ def test_images_are_never_those_of_another_flight(tmp_path):
 
 
 @pytest.mark.parametrize("cut", [1, 30, 700, 5000])
-def test_half_a_flight_is_refused(tmp_path, cut):
+def test_an_incomplete_flight_is_refused(tmp_path, cut):
     path = tmp_path / "flight.csv"
     write_trajectory(path, random_flight(), "circle")
     path.write_bytes(path.read_bytes()[:-cut])
@@ -162,7 +162,7 @@ def test_short_flights_and_agents_without_decoder_leave_no_dream():
 
 
 @pytest.mark.parametrize("damage", [lambda data: data[:2000], lambda data: data[:2000] + bytes(99) + data[2099:]])
-def test_half_a_dream_is_refused(tmp_path, damage):
+def test_an_incomplete_dream_is_refused(tmp_path, damage):
     path = tmp_path / "a_dream.npz"
     record_dream(DREAMER, random_flight(pixels=True), as_they_are).save(path)
     path.write_bytes(damage(path.read_bytes()))

@@ -196,7 +196,7 @@ def test_gates_and_laps_are_those_flown(report):
     assert report["ended"] == "finished" and report["problems"] == []
 
 
-def test_what_is_said_of_the_flight(report):
+def test_the_summary_of_a_flight(report):
     assert (report["actor"], report["track"], report["rate_hz"]) == ("wobble", "circle", 50.0)
     assert report["armed_s"] == pytest.approx(gate_time(7) - ENABLED, abs=PERIOD)
     assert report["flown"]["gates"] == 8
@@ -231,7 +231,7 @@ def test_a_known_lag_is_found(lag):
     assert error["lag_ms"] == pytest.approx(1e3 * lag, abs=1.0) and error["rms"] == pytest.approx(0.2, abs=0.05)
 
 
-def test_of_too_little_no_error_is_said():
+def test_too_few_measurements_give_no_error():
     asked_time = np.arange(0.0, 1.0, 0.02)
     response = Response(asked_time, asked_time, np.linspace(0.0, 0.4, 40), np.zeros(40))
     assert tracking_error(response) is None
@@ -364,7 +364,7 @@ def test_times_out_of_order_are_refused(tmp_path, flown):
         write_report(tmp_path)
 
 
-def test_an_unknown_track_is_said(tmp_path, flown):
+def test_an_unknown_track_is_refused(tmp_path, flown):
     with FlightRecorder(tmp_path / FILE, {"track": "nowhere"}) as recorder:
         recorder.tick(0.0, Flight(flown).ticks[0])
     with pytest.raises(ValueError, match="nowhere"):
@@ -379,7 +379,7 @@ def test_a_flight_whose_loop_was_killed(tmp_path, flown, share, unseen):
     assert "note: the file is incomplete: the loop was killed, or is still running" in lines
 
 
-def test_damage_is_said(tmp_path, flown):
+def test_a_damaged_recording_is_refused(tmp_path, flown):
     data = bytearray((flown / FILE).read_bytes())
     data[len(data) // 2 : len(data) // 2 + 4000] = bytes(4000)
     (tmp_path / FILE).write_bytes(data)

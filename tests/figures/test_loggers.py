@@ -91,7 +91,7 @@ def test_other_loggers_need_not_know_of_films(run_dir, tmp_path):
     log_evaluation([CSVLogger(exp_name="other", log_dir=str(tmp_path))], RunDirectory(run_dir), 2000)
 
 
-def test_what_is_not_there_is_refused(tmp_path, monkeypatch):
+def test_a_missing_wandb_is_refused(tmp_path, monkeypatch):
     monkeypatch.setattr(importlib.util, "find_spec", lambda name: None)
     with pytest.raises(ValueError, match=r"needs the package wandb: .*pip install .*\[wandb\]'"):
         make_loggers(tmp_path, OFFLINE)

@@ -202,7 +202,7 @@ class GateSweeper:
 
     def _cross_gates(self, position: torch.Tensor, segment: torch.Tensor) -> _Crossings:
         """Intersect every segment with every race gate's plane; position is (3, P + 1, N)."""
-        forward, left, up = self._turn(position)
+        forward, left, up = self._to_gate_axes(position)
         ahead = forward >= 0
         before, after = forward[:, :-1], forward[:, 1:]
         fraction = before / (before - after)
@@ -214,7 +214,7 @@ class GateSweeper:
             up=torch.addcmul(up[:, :-1], fraction, up.diff(dim=1)),
         )
 
-    def _turn(self, position: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+    def _to_gate_axes(self, position: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
         """Return positions (3, P + 1, N) relative to every race gate: forward, left and up, (G, P + 1, N) each."""
         x, y, z = position.unbind(0)
         forward = x * self._cos + y * self._sin - self._centre_forward
@@ -263,7 +263,7 @@ class GateSweeper:
         Within the outer box, a segment is farthest from the gate's axis at one of its ends, so only the ends need to
         be tested against the opening.
         """
-        forward, left, up = self._turn(position)
+        forward, left, up = self._to_gate_axes(position)
         sides = (
             _within(forward, self._half_depth),
             _within(left, self._half_outer),
@@ -272,7 +272,7 @@ class GateSweeper:
         enter = torch.stack([side[0] for side in sides]).amax(0).clamp(min=0)  # (G, P, N)
         leave = torch.stack([side[1] for side in sides]).amin(0).clamp(max=1)
         starts_outside, ends_outside = (
-            torch.maximum(_at(left, fraction).abs(), _at(up, fraction).abs()) >= self._half_opening
+            torch.maximum(_interpolate(left, fraction).abs(), _interpolate(up, fraction).abs()) >= self._half_opening
             for fraction in (enter, leave)
         )
         out_of_opening = torch.minimum(_within(left, self._half_opening)[1], _within(up, self._half_opening)[1])
@@ -324,6 +324,6 @@ def _within(axis: torch.Tensor, half: float) -> tuple[torch.Tensor, torch.Tensor
     return torch.minimum(one, other), torch.maximum(one, other)
 
 
-def _at(axis: torch.Tensor, fraction: torch.Tensor) -> torch.Tensor:
+def _interpolate(axis: torch.Tensor, fraction: torch.Tensor) -> torch.Tensor:
     """Interpolate coordinates (G, P + 1, N) along each segment at a fraction (G, P, N)."""
     return torch.addcmul(axis[:, :-1], fraction, axis.diff(dim=1))

@@ -26,13 +26,13 @@ def load_warp() -> Any:
     import warp
 
     warp.config.log_level = warp.LOG_ERROR
-    with nullcontext() if torch.cuda.is_available() else _silent():
+    with nullcontext() if torch.cuda.is_available() else _silenced_stderr():
         warp.init()
     return warp
 
 
 @contextmanager
-def _silent() -> Iterator[None]:
+def _silenced_stderr() -> Iterator[None]:
     """Discard what compiled code writes to standard error, where warp warns of an absent driver."""
     sys.stderr.flush()
     kept, nowhere = os.dup(2), os.open(os.devnull, os.O_WRONLY)

@@ -230,13 +230,13 @@ def boxes_intersect(gate: Gate, side: float, other: Gate, other_side: float, dep
     if abs(gap[2]) >= (side + other_side) / 2:
         return False
     for axis in (gate.forward, gate.left, other.forward, other.left):
-        reach = _half_shadow(gate, side, depth, axis) + _half_shadow(other, other_side, depth, axis)
+        reach = _half_projection(gate, side, depth, axis) + _half_projection(other, other_side, depth, axis)
         if abs(_dot(gap, axis)) >= reach:
             return False
     return True
 
 
-def _half_shadow(gate: Gate, side: float, depth: float, axis: Vector) -> float:
+def _half_projection(gate: Gate, side: float, depth: float, axis: Vector) -> float:
     """Return half the length of a gate box's projection on a horizontal axis, m."""
     return (depth * abs(_dot(gate.forward, axis)) + side * abs(_dot(gate.left, axis))) / 2
 

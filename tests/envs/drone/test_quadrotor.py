@@ -278,7 +278,7 @@ def test_control_step_must_be_a_multiple_of_the_physics_step() -> None:
         ("randomisation", True, "randomisation=True: must be a Randomisation or None"),
     ],
 )  # fmt: skip
-def test_drones_that_cannot_be_are_refused(name: str, value: object, words: str) -> None:
+def test_bad_parameters_are_refused(name: str, value: object, words: str) -> None:
     with pytest.raises(ValueError, match=f"QuadrotorParameters: .*{words}"):
         QuadrotorParameters(**{name: value})
 
@@ -294,7 +294,7 @@ def test_drones_that_cannot_be_are_refused(name: str, value: object, words: str)
         ("thrust", "much", "thrust='much': must be a number"),
     ],
 )  # fmt: skip
-def test_widths_by_which_no_drone_can_differ_are_refused(name: str, value: object, words: str) -> None:
+def test_bad_randomisation_widths_are_refused(name: str, value: object, words: str) -> None:
     with pytest.raises(ValueError, match=f"Randomisation: {words}"):
         Randomisation(**{name: value})
 

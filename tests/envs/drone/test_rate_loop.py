@@ -172,7 +172,7 @@ def test_a_flight_goes_on_from_its_state() -> None:
         (lambda: Randomisation(delay_min=0.05), "delay_min=0.05: must be at most delay_max=0.04"),
     ],
 )
-def test_what_no_firmware_can_be_is_refused(make, words: str) -> None:
+def test_bad_firmware_parameters_are_refused(make, words: str) -> None:
     with pytest.raises(ValueError, match=words):
         make()
 
@@ -210,7 +210,7 @@ def test_a_drone_comes_back_from_its_file(tmp_path: Path) -> None:
     assert "gyro_lpf2" not in path.read_text(), "only what differs is written"
 
 
-def test_a_file_by_hand_may_be_of_any_preset(tmp_path: Path) -> None:
+def test_a_drone_file_may_change_any_preset(tmp_path: Path) -> None:
     path = tmp_path / "mine.yml"
     path.write_text("preset: faithful\nparameters: {mass: 0.5, drag: [0.1, 0.1, 0.2]}\n")
     assert load_preset(str(path)) == replace(PRESETS["faithful"], mass=0.5, drag=(0.1, 0.1, 0.2))
@@ -233,7 +233,7 @@ def test_a_file_by_hand_may_be_of_any_preset(tmp_path: Path) -> None:
         ("preset: betaflight\nparameters: {betaflight: {p: [1, 2, -3]}}", "p=.*: must be three numbers"),
     ],
 )
-def test_what_is_no_drone_is_refused_by_file_and_field(text: str | None, words: str, tmp_path: Path) -> None:
+def test_bad_drone_files_are_refused_by_file_and_field(text: str | None, words: str, tmp_path: Path) -> None:
     path = tmp_path / "drone.yaml"
     if text is not None:
         path.write_text(text)

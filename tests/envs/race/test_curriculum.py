@@ -61,7 +61,7 @@ def test_state_continues_exactly():
     assert expected[449] < expected[-1]
 
 
-def test_nonsense_is_refused():
+def test_a_window_of_no_episodes_is_refused():
     with pytest.raises(ValueError, match="window=0"):
         BodyRateCurriculum(BodyRateSchedule(window=0))
 

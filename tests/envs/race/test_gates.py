@@ -186,7 +186,7 @@ def test_gates_that_are_not_the_target():
     assert sweep(PLAIN, [(-0.1, 0.8, 3), (0.1, 0.8, 3)], target=1) == (False, 0.0, FRAME)
 
 
-def test_decoys_are_air():
+def test_decoys_do_not_collide():
     assert sweep(PLAIN, [(4.9, 0, 3), (5.1, 0, 3)]) == (False, 0.0, NONE)
     assert sweep(PLAIN, [(4.9, 0.8, 3), (5.1, 0.8, 3)]) == (False, 0.0, NONE)
     assert sweep(PLAIN, [(5.1, 0, 3), (4.9, 0, 3)]) == (False, 0.0, NONE)

@@ -132,7 +132,7 @@ def test_a_stored_line_is_what_planning_finds(monkeypatch):
 @pytest.mark.parametrize("limits", [LineLimits(), START_LINE], ids=["pilot", "starts"])
 @pytest.mark.parametrize("preset", PRESETS)
 @pytest.mark.parametrize("track", BUILTIN_TRACKS)
-def test_the_line_of_what_ships_is_stored_and_searching_on_finds_no_better(track, preset, limits, monkeypatch):
+def test_stored_lines_are_not_improved_by_further_search(track, preset, limits, monkeypatch):
     """If not: a track, a drone or the search has changed, so call `racing_line.store_lines()`."""
     track, drone = load_track(track), PRESETS[preset]
     nodes, costs = LineNodes(track, limits.gate_offset), []

@@ -280,7 +280,7 @@ def test_outcomes_are_not_changed_by_later_steps():
 
 @given(st.integers(0, 2**31))
 @settings(max_examples=10, deadline=None)
-def test_any_flight_keeps_the_books(seed):
+def test_random_flights_keep_the_invariants(seed):
     """Random flights of many drones: invariants of every outcome, and each drone alone fares the same."""
     generator = torch.Generator().manual_seed(seed)
     target = torch.randint(4, (8,), generator=generator)

@@ -56,7 +56,7 @@ def collected_in(seconds: float) -> bool:
 
 
 @pytest.mark.parametrize("keep", ["a circle", "nothing"])
-def test_one_that_is_let_go_is_freed_and_nobody_waits_for_ever(keep: str) -> None:
+def test_a_renderer_without_references_is_freed_without_deadlock(keep: str) -> None:
     freed: list[bool] = []
     renderer = Renderer("noted", lambda: NotedWorker(freed), Camera(), num_workers=2)
     threads = {thread for thread in threading.enumerate() if thread.name.startswith("render_")}

@@ -331,6 +331,6 @@ def test_bad_looks_are_refused() -> None:
 
 
 @pytest.mark.parametrize(("lens", "width", "most"), [(90.0, 95.0, 90), (90.0, 90.0, 90), (120.0, 60.0, 60)])
-def test_lenses_vary_no_further_than_there_are_any(lens: float, width: float, most: int) -> None:
+def test_varied_fields_of_view_stay_between_0_and_180_degrees(lens: float, width: float, most: int) -> None:
     with pytest.raises(ValueError, match=f"field_of_view={width}: must be below {most}, so that {lens:g} degrees"):
         worlds(LooksRandomisation(field_of_view=width), "warp", camera=Camera(field_of_view=lens))

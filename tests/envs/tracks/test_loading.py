@@ -257,7 +257,7 @@ def test_refusals_name_file_field_and_value(write, case):
     ],
     ids=["a gate", "the start", "the next lap"],
 )
-def test_a_way_that_no_flight_is_long_enough_for(write, field, gate, start, laps):
+def test_a_leg_beyond_the_range_of_a_flight_is_refused(write, field, gate, start, laps):
     """The second gate at x=gate; where there is a next lap, a third as far to the left of it."""
     far = [[0, 0, 1.35], [gate, 0, 1.35], [gate, gate, 1.35]] if laps > 1 else [[0, 0, 1.35], [gate, 0, 1.35]]
     gates = "".join(f"  - {{position: {position}, yaw_degrees: 0}}\n" for position in far)
@@ -292,14 +292,14 @@ def test_a_lap_needs_two_gates(write, count, listed):
         (f"# {'x' * 200_000}\ngates: []", "200,0.. bytes, but must have no more than 100,000"),
     ],
 )
-def test_files_that_are_no_track(write, text, message):
+def test_files_that_are_no_track_are_refused(write, text, message):
     path = write(text)
     with pytest.raises(TrackError, match=message) as refusal:
         load_track(path)
     assert str(path) in str(refusal.value)
 
 
-def test_a_file_that_is_no_text(tmp_path):
+def test_a_binary_file_is_refused(tmp_path):
     path = tmp_path / "binary.yaml"
     path.write_bytes(b"\xff\xfe\x00\xd8")
     with pytest.raises(TrackError, match=r"binary\.yaml: the track file cannot be read"):
@@ -307,13 +307,13 @@ def test_a_file_that_is_no_text(tmp_path):
 
 
 @pytest.mark.parametrize("value", [None, 3, 1.5, ["kidney"], b"kidney"])
-def test_what_is_neither_name_nor_path(value):
+def test_other_types_than_names_and_paths_are_refused(value):
     with pytest.raises(TrackError, match="a track is a name, the path of a .yaml file or a Track, not "):
         load_track(value)
 
 
 @pytest.mark.parametrize("path", ["x" * 5000 + ".yaml", "a\0b.yaml"])
-def test_paths_that_no_system_has(path):
+def test_impossible_paths_are_refused(path):
     with pytest.raises(TrackError, match="the track file ") as refusal:
         load_track(path)
     assert len(str(refusal.value)) < 500
