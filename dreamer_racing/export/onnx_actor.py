@@ -301,12 +301,12 @@ def read_contract(path: str | Path) -> dict[str, Any]:
             f"{path}: format {found[0]!r}, version {found[1]!r}; this file reads {FORMAT!r}, versions {known}. "
             "Use the onnx_actor.py of the release that exported it, or export again."
         )
-    if misfit := _unlike(contract, _LAYOUT, "") or _unfit(contract):
+    if misfit := _layout_mismatch(contract, _LAYOUT, "") or _inconsistency(contract):
         raise ValueError(f"{path}: {misfit}. Copy it from the export again.")
     return contract
 
 
-def _unlike(value: Any, layout: Any, name: str) -> str:
+def _layout_mismatch(value: Any, layout: Any, name: str) -> str:
     """Return a message about the first mismatch between a value and its layout, or an empty string."""
     if isinstance(layout, dict):
         if not isinstance(value, dict):
@@ -329,10 +329,10 @@ def _unlike(value: Any, layout: Any, name: str) -> str:
             kinds = {float: "a number", int: "a whole number", str: "a string"}
             return f"{name} is {_short(value)}, not {kinds[layout]}"
         return ""
-    return next(filter(None, (_unlike(*part) for part in parts)), "")
+    return next(filter(None, (_layout_mismatch(*part) for part in parts)), "")
 
 
-def _unfit(contract: dict[str, Any]) -> str:
+def _inconsistency(contract: dict[str, Any]) -> str:
     """Return a message about the first inconsistency in a contract of correct layout, or an empty string."""
     names = [entry["name"] for entry in contract["inputs"]]
     if absent := [name for name in (*RECURRENT, "is_init") if name not in names]:

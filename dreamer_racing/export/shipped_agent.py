@@ -30,7 +30,7 @@ AVERAGED, TRAINED = "averaged", "trained"
 CHOICES = ("auto", AVERAGED, TRAINED)
 """Choices of a checkpoint's weights: ``auto`` takes the averaged ones if the checkpoint has them."""
 
-_ABSENT = ("critic", "world_model.reward_head", "world_model.continue_head")
+_UNUSED_MODULES = ("critic", "world_model.reward_head", "world_model.continue_head")
 _SETTINGS = {
     "camera.width_px": "env.image_size",
     "camera.height_px": "env.image_size",
@@ -129,10 +129,10 @@ class ShippedAgent:
         """
         folder, device = Path(folder), torch.device(device)
         about, contract = read_about(folder), read_contract(folder / CONTRACT)
-        _refuse_lacking(folder, *(file["name"] for part in PARTS if (file := contract["files"].get(part))))
+        _require_files(folder, *(file["name"] for part in PARTS if (file := contract["files"].get(part))))
         check_env(folder, contract, env)
         agent = Agent(_size(contract["model"]), Interface.of(env), decode=False)
-        for name in _ABSENT:
+        for name in _UNUSED_MODULES:
             parent, _, child = name.rpartition(".")
             agent.get_submodule(parent).register_module(child, None)
         load_networks(folder, agent)
@@ -181,14 +181,14 @@ def read_about(folder: str | Path) -> dict[str, Any]:
         ValueError: If agent.json is not valid JSON.
     """
     folder = Path(folder)
-    _refuse_lacking(folder, *FILES)
+    _require_files(folder, *FILES)
     try:
         return json.loads((folder / AGENT).read_text(encoding="utf-8"))
     except ValueError as error:
         raise ValueError(f"{folder / AGENT} is not valid JSON: {error}.") from error
 
 
-def _refuse_lacking(folder: Path, *names: str) -> None:
+def _require_files(folder: Path, *names: str) -> None:
     if missing := [name for name in names if not (folder / name).is_file()]:
         raise FileNotFoundError(f"The agent {folder} lacks {', '.join(missing)}: copy the whole folder again.")
 
@@ -219,7 +219,8 @@ def check_env(folder: str | Path, contract: dict[str, Any], env: DroneRacingEnv)
         if not (math.isclose(trained, given, rel_tol=1e-6, abs_tol=1e-9) if numbers else trained == given):
             setting = _SETTINGS.get(name, name)
             raise ValueError(
-                f"{setting}={given}: the agent {folder} was trained with {setting}={trained}, and flies only with that."
+                f"{setting}={given}: the agent {folder} was trained with {setting}={trained}, and flies "
+                "with nothing else."
             )
 
 

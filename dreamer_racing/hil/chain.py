@@ -194,7 +194,7 @@ class FlightChain:
         poses = [pose for received in inputs.received if (pose := self.clock.read(received)) is not None]
         for pose in poses:
             self._newest = pose
-            self._look_for_a_rise(pose)
+            self._track_rise(pose)
             self.progress.update(pose, judged=pose is poses[-1])
         self._flying |= self._has_risen()
         pose = None if self._newest is None else extrapolate(self._newest, inputs.time)
@@ -235,7 +235,7 @@ class FlightChain:
         weights = 1.0 + (config.lift - 1.0) * min(max(share, 0.0), 1.0)
         return Setpoint(weights * GRAVITY, np.zeros(3))
 
-    def _look_for_a_rise(self, pose: Pose) -> None:
+    def _track_rise(self, pose: Pose) -> None:
         """Note since when consecutive poses during the lift show the vehicle rising."""
         if not self._lifting:
             self._stand_height = float(pose.position[2])
@@ -261,7 +261,7 @@ class FlightChain:
         if pose is None:
             return None, None, 0.0, 0.0
         start = time.perf_counter()
-        image = self._look(pose)
+        image = self._update_image(pose)
         drawn = time.perf_counter()
         imu = () if not self.needs_imu or self._newest_imu is None else (self._newest_imu.sample,)
         act: Callable[..., Setpoint] = self._flyer.act  # takes the IMU sample, too, if the flyer needs it
@@ -284,7 +284,7 @@ class FlightChain:
         self.progress.reset()
         self._image = None
 
-    def _look(self, pose: Pose) -> np.ndarray | None:
+    def _update_image(self, pose: Pose) -> np.ndarray | None:
         """Return the flyer's image: a new one, or the last one if the camera is slower than the ticks."""
         if self._camera is None:
             return None

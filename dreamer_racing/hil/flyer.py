@@ -150,7 +150,7 @@ def check_rate_loop(contract: dict[str, Any], vehicle: str, force: bool) -> str 
     trained, there = _trained_loop(contract), load_preset(vehicle)
     if trained is None:
         return f"the contract does not describe a rate loop: it was not compared with vehicle={vehicle}"
-    if (misfit := _unlike_loop(trained, there)) is None:
+    if (misfit := _rate_loop_mismatch(trained, there)) is None:
         return None
     words = f"The actor was trained with {misfit[0]}, but vehicle={vehicle} has {misfit[1]}"
     return _refuse_loop(words, f"env=betaflight env.preset={vehicle}", force)
@@ -202,7 +202,7 @@ def _name_loop(kind: str) -> str:
     return {"proportional": "a proportional rate loop", "betaflight": "a Betaflight's rate loop"}.get(kind, kind)
 
 
-def _unlike_loop(trained: dict[str, Any], there: QuadrotorParameters) -> tuple[str, str] | None:
+def _rate_loop_mismatch(trained: dict[str, Any], there: QuadrotorParameters) -> tuple[str, str] | None:
     """Return the first mismatch in words, of the contract's and the vehicle's rate loop; None if within tolerances."""
     kind = "proportional" if there.betaflight is None else "betaflight"
     if trained["kind"] != kind:
@@ -251,12 +251,12 @@ def check_ranges(contract: dict[str, Any], limits: SafetyLimits, user_limits: Co
     for name, wanted, most, unit in compared:
         if all(want <= limit + 1e-6 for want, limit in zip(wanted, most, strict=True)):
             continue
-        words = f"limits.{name}={_listed(most)} clips the actor, which asks for up to {_listed(wanted)} {unit}"
+        words = f"limits.{name}={_format(most)} clips the actor, which asks for up to {_format(wanted)} {unit}"
         if name not in user_limits:
-            raise ValueError(f"{words}. Set limits.{name}={_listed(wanted)}, or a smaller one if clipping is intended.")
+            raise ValueError(f"{words}. Set limits.{name}={_format(wanted)}, or a smaller one if clipping is intended.")
         clipped.append(words)
     return clipped
 
 
-def _listed(numbers: list[float]) -> str:
+def _format(numbers: list[float]) -> str:
     return f"{numbers[0]:g}" if len(numbers) == 1 else f"[{','.join(f'{number:g}' for number in numbers)}]"

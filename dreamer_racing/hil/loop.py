@@ -168,7 +168,7 @@ class FlightLoop:
         Returns:
             Why it ended.
         """
-        with self._answering_signals(), _without_garbage_collection():
+        with self._handling_signals(), _without_garbage_collection():
             try:
                 self._chain.warm_up()
                 return self._run(duration, patience)
@@ -184,7 +184,7 @@ class FlightLoop:
             self._clock.sleep_until(deadline)
             start = self._clock.now()
             outputs = self._tick(start, deadline, overrun, armed)
-            words = self._say_why_not(outputs, flew)
+            words = self._log_reasons(outputs, flew)
             armed = outputs.verdict.command.armed
             if armed and not flew:
                 flew, began = True, start
@@ -203,7 +203,7 @@ class FlightLoop:
                 return f"{most:g} s are over" + ("" if flew else f"; not armed: {words}")
         return self._stop + ("" if flew else f"; not armed: {words}")
 
-    def _say_why_not(self, outputs: Outputs, flew: bool) -> str:
+    def _log_reasons(self, outputs: Outputs, flew: bool) -> str:
         """Log why the vehicle is not armed, or why the flight ended, when it changes; return it. In flight log nothing.
 
         An enable that comes and goes is no change as long as another reason prevents arming.
@@ -235,7 +235,7 @@ class FlightLoop:
         sent = self._send(outputs.verdict.command)
         self._dropped = not sent or heard is None
         done = self._clock.now()
-        self._note(start - deadline, inputs, outputs, done)
+        self._record_timings(start - deadline, inputs, outputs, done)
         took = {"jitter": start - deadline, "render": outputs.render_s, "act": outputs.act_s, "sent": done - start}
         self._show(inputs, outputs, took, sent)
         shown = self._clock.now()
@@ -307,7 +307,7 @@ class FlightLoop:
         self.statistics.overruns += left_out + 1
         return following + self._period * left_out, left_out + 1
 
-    def _note(self, jitter: float, inputs: Inputs, outputs: Outputs, done: float) -> None:
+    def _record_timings(self, jitter: float, inputs: Inputs, outputs: Outputs, done: float) -> None:
         noted = self.statistics
         noted.jitter.append(jitter)
         noted.busy.append(done - inputs.time)
@@ -333,7 +333,7 @@ class FlightLoop:
             self._clock.sleep_until(deadline)
 
     @contextmanager
-    def _answering_signals(self) -> Iterator[None]:
+    def _handling_signals(self) -> Iterator[None]:
         """Let the signals of `ENDING` end the flight; a second one does not interrupt the final disarm frames."""
 
         def stop(number: int, frame: FrameType | None) -> None:

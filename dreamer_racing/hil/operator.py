@@ -98,7 +98,7 @@ class UdpOperator:
         self._socket = bind(host, port)
         self.address: tuple[str, int] = self._socket.getsockname()
         self._clock = clock
-        self._will = Operator(False, False)
+        self._wish = Operator(False, False)
         self._heard = -DEAD_MAN
         self._sequence: int | None = None
 
@@ -111,7 +111,7 @@ class UdpOperator:
                 break
             self._take(decode_operator(data))
         alive = self._clock() - self._heard < DEAD_MAN
-        return Operator(self._will.enable and alive, self._will.kill)
+        return Operator(self._wish.enable and alive, self._wish.kill)
 
     def _take(self, packet: tuple[int, Operator] | None) -> None:
         if packet is None:
@@ -124,7 +124,7 @@ class UdpOperator:
             self.rejected += 1
         else:
             self._sequence, self._heard = sequence, self._clock()
-        self._will = Operator(self._will.enable if replayed else will.enable, self._will.kill or will.kill)
+        self._wish = Operator(self._wish.enable if replayed else will.enable, self._wish.kill or will.kill)
 
     def close(self) -> None:
         """Close the socket."""
@@ -149,7 +149,7 @@ class KeyboardOperator:
         self._select, self._termios = select.select, termios
         self._before: list[Any] | None = termios.tcgetattr(self._terminal)
         tty.setcbreak(self._terminal)
-        self._will = Operator(False, False)
+        self._wish = Operator(False, False)
 
     def poll(self, armed: bool = False) -> Operator:
         """Return the operator's wish, without blocking."""
@@ -158,9 +158,9 @@ class KeyboardOperator:
                 keys = os.read(self._terminal.fileno(), 1024)  # bypasses Python's buffer, which select does not see
             except OSError:
                 keys = b""  # the terminal is gone
-            enable = self._will.enable ^ bool(keys.count(b"e") % 2)
-            self._will = Operator(enable, self._will.kill or not keys or bool(keys.strip(b"e")))
-        return self._will
+            enable = self._wish.enable ^ bool(keys.count(b"e") % 2)
+            self._wish = Operator(enable, self._wish.kill or not keys or bool(keys.strip(b"e")))
+        return self._wish
 
     def close(self) -> None:
         """Restore the terminal's settings."""

@@ -127,7 +127,7 @@ class Safety:
         self._overruns: deque[float] = deque(maxlen=int(limits.overruns_max) + 1)
         self._least: Vector = (float(limits.thrust_min), 0.0, 0.0, 0.0)  # thrust and body rates
         self._sent: Vector = _IDLE
-        self._forget()
+        self._reset_history()
 
     @property
     def armed(self) -> bool:
@@ -153,10 +153,10 @@ class Safety:
             self.state = State.CUT
         elif self.armed:
             findings |= self._check_setpoint(tick)
-            self._fly_on(findings, tick.finish)
+            self._continue_flight(findings, tick.finish)
         else:
             findings |= self._check_start(tick)
-            self._stay_or_arm(findings)
+            self._maybe_arm(findings)
         if tick.operator is not None and tick.operator.enable:
             self._ready = False
         if self._arming:
@@ -177,7 +177,7 @@ class Safety:
     def _arming(self) -> bool:
         return self.armed and self._now - self._armed_at < self.limits.arm_time
 
-    def _fly_on(self, findings: Findings, finish: bool) -> None:
+    def _continue_flight(self, findings: Findings, finish: bool) -> None:
         if self.cuts(findings):
             self.state = State.CUT
         elif finish:
@@ -186,7 +186,7 @@ class Safety:
         else:
             self.state = State.HOLD if findings else State.FLYING
 
-    def _stay_or_arm(self, findings: Findings) -> None:
+    def _maybe_arm(self, findings: Findings) -> None:
         if Reason.KILL in findings:
             self.state = State.CUT
         elif not findings:
@@ -217,7 +217,7 @@ class Safety:
         )
         return Command(True, Setpoint(self._sent[0], np.array(self._sent[1:])))
 
-    def _forget(self) -> None:
+    def _reset_history(self) -> None:
         """Reset all that was measured by a clock that has jumped or only just started."""
         self._motion = Motion(self.limits)
         self._measured_at = -math.inf
@@ -235,7 +235,7 @@ class Safety:
         forwards = 0.0 <= step <= self.limits.tick_max
         self._elapsed = step if forwards else 0.0
         if not forwards:
-            self._forget()
+            self._reset_history()
         if math.isfinite(now) and (forwards or math.isnan(step)):
             return {}
         return {Reason.CLOCK: f"the clock moved by {step:g} s from tick to tick (allowed: {self.limits.tick_max:g})"}
@@ -308,7 +308,7 @@ class Safety:
             self._upright_at = self._now
             return findings
         if not is_within(seen.position, limits.fence_low, limits.fence_high):
-            findings[Reason.GEOFENCE] = f"at {_say(seen.position)} m it is outside the fence"
+            findings[Reason.GEOFENCE] = f"at {_format_point(seen.position)} m it is outside the fence"
         if seen.speed > limits.speed_max:
             findings[Reason.SPEED] = f"it moves at {seen.speed:.3g} m/s (allowed: {limits.speed_max:g})"
         if seen.tilt_degrees <= limits.tilt_max_degrees:
@@ -394,5 +394,5 @@ def _clip(value: float, low: float, high: float) -> float:
     return min(max(value, low), high)
 
 
-def _say(point: Vector) -> str:
+def _format_point(point: Vector) -> str:
     return f"({', '.join(f'{value:.3g}' for value in point)})"

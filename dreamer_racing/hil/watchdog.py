@@ -67,9 +67,9 @@ class Watchdog:
     def _watch(self) -> None:
         while not self._closed.wait(self._longest / CHECKS):
             with self._sending:
-                self._look()
+                self._check_loop()
 
-    def _look(self) -> None:
+    def _check_loop(self) -> None:
         """Send a disarm frame if the loop is late, or ever was."""
         if not self._is_late():
             return

@@ -88,7 +88,7 @@ class Plant:
         incoming: socket.socket | None = None,
     ) -> None:
         self.vehicle, self.controls = vehicle, controls
-        self._incoming, self._told = incoming, 0
+        self._incoming, self._imu_packets = incoming, 0
         self.commander: Any = None
         self._poses, self._send = PoseDelivery(delivery), send
         self.time = 0.0
@@ -107,17 +107,17 @@ class Plant:
                 self.controls.act(due)
             if self._poses.next_measurement <= due:
                 self._poses.measure(self.vehicle.pose(), due)
-                self._tell_imu()
+                self._send_imu()
             for packet in self._poses.depart(due):
                 self._send(packet)
         self._fly_to(until)
 
-    def _tell_imu(self) -> None:
+    def _send_imu(self) -> None:
         if self._incoming is None or self.commander is None:
             return
-        self._told += 1
+        self._imu_packets += 1
         with suppress(OSError):  # a receiver that has gone does not concern the plant
-            self._incoming.sendto(encode_imu(self._told, self.time, self.vehicle.read_imu()), self.commander)
+            self._incoming.sendto(encode_imu(self._imu_packets, self.time, self.vehicle.read_imu()), self.commander)
 
     def _fly_to(self, until: float) -> None:
         if until > self.time:

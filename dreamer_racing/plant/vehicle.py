@@ -239,17 +239,17 @@ class PlantVehicle:
         else:
             self._turn_and_step()
         if self._supported:
-            hovers = self.armed and self._asked() >= HOVER_SHARE * self.parameters.mass * GRAVITY
+            hovers = self.armed and self._commanded_thrust() >= HOVER_SHARE * self.parameters.mass * GRAVITY
             self._hover_steps = self._hover_steps + 1 if hovers else 0
         if self.on_stand:
             self._hold(self._start)
-            self._maybe_let_go()
+            self._maybe_release()
         elif self.crash is CrashCause.NONE:
             if self._supported:
                 self._support()
             self._check_race()
         elif not self._qpos[2] > GROUND_HEIGHT:  # also true of NaN
-            self._lie()
+            self._rest_on_ground()
         self._acceleration = (self._qvel[:3] - before) / self.parameters.physics_dt
 
     def _turn_and_step(self) -> None:
@@ -271,18 +271,18 @@ class PlantVehicle:
         """Keep the body at a place (7,), at rest."""
         self._qpos[:], self._qvel[:] = place, 0.0
 
-    def _lie(self) -> None:
+    def _rest_on_ground(self) -> None:
         """Keep a fallen drone on the ground where it fell, or at the start if its state is not finite."""
         place = self._qpos if np.isfinite(self._qpos).all() else self._start
         self._hold(np.array((*place[:2], GROUND_HEIGHT, *place[3:])))
 
-    def _asked(self) -> float:
+    def _commanded_thrust(self) -> float:
         """Return the commanded thrust, N."""
         return float(self._setpoint[0] if self._target_speed is None else np.square(self._target_speed).sum())
 
-    def _maybe_let_go(self) -> None:
+    def _maybe_release(self) -> None:
         """Release the drone once enough thrust has been commanded for long enough."""
-        if not (self.armed and self._asked() > LIFT_OFF * self.parameters.mass * GRAVITY):
+        if not (self.armed and self._commanded_thrust() > LIFT_OFF * self.parameters.mass * GRAVITY):
             self._lift_off_step = None
             return
         if self._lift_off_step is None:

@@ -246,7 +246,7 @@ def _receiver(link: str) -> list[Setting]:
 
 def _switches(link: str) -> tuple[Setting, ...]:
     """Return the settings of the switches for arming and flight modes."""
-    return _BY_PILOT if link == "msp_override" else _BY_LINK
+    return _ARMED_BY_PILOT if link == "msp_override" else _ARMED_BY_LINK
 
 
 def _rates(contract: dict[str, Any]) -> list[Setting]:
@@ -302,13 +302,13 @@ _OVERRIDE = (
         "msp_override_failsafe", "OFF", "a lost receiver must cause a failsafe, whatever MSP sends", "OFF", absent=True
     ),
 )
-_BY_PILOT = (
+_ARMED_BY_PILOT = (
     Setting("ARM by a switch", "ON", "the pilot arms and disarms, by any switch of the receiver",
             line=f"aux 0 {ARM} 0 1700 2100 0 0"),
     Setting("MSP OVERRIDE by another", "ON", "the pilot hands over and takes back control; ANGLE must be off meanwhile",
             line=f"aux 1 {MSP_OVERRIDE} 1 1700 2100 0 0"),
 )  # fmt: skip
-_BY_LINK = (
+_ARMED_BY_LINK = (
     Setting("ARM", "AUX1 1700-2100", "AUX1 arms, at 2000 us; nothing else may arm",
             line=f"aux 0 {ARM} 0 1700 2100 0 0"),
     Setting("levelling", "OFF", "in the Modes tab, by hand: sticks mean rates with AUX1 at 2000 us, the others at 1000",

@@ -122,7 +122,7 @@ class SerialOverTcp:
         host: Address of this machine.
     """
 
-    _AGAIN = 0.5  # s between attempts to connect
+    _RETRY_AFTER = 0.5  # s between attempts to connect
 
     def __init__(self, port: int, host: str = "127.0.0.1") -> None:
         self._address = (host, port)
@@ -139,7 +139,7 @@ class SerialOverTcp:
         except BlockingIOError:
             return False
         except OSError:
-            self._lose()
+            self._disconnect()
             return False
 
     def read(self) -> bytes:
@@ -153,7 +153,7 @@ class SerialOverTcp:
         except OSError:
             data = b""
         if not data:
-            self._lose()
+            self._disconnect()
         return data
 
     def close(self) -> None:
@@ -164,13 +164,13 @@ class SerialOverTcp:
 
     def _connect(self) -> socket.socket | None:
         if self._socket is None and time.monotonic() >= self._next:
-            self._next = time.monotonic() + self._AGAIN
+            self._next = time.monotonic() + self._RETRY_AFTER
             self._socket = socket.socket(socket.AF_INET, socket.SOCK_STREAM)
             self._socket.setblocking(False)
             self._socket.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
             self._socket.connect_ex(self._address)  # if nobody listens, the first write fails
         return self._socket
 
-    def _lose(self) -> None:
+    def _disconnect(self) -> None:
         self.close()
-        self._next = time.monotonic() + self._AGAIN
+        self._next = time.monotonic() + self._RETRY_AFTER

@@ -116,7 +116,7 @@ def _check_speed(link: TransportLink, config: LinkConfig) -> None:
     """Refuse a serial port so slow that commands would queue up and be dropped."""
     if config.device is None or config.rate is None:
         return
-    settings = _wire_settings(config)
+    settings = _serial_settings(config)
     size = link.longest
     most = 1.0 / settings.seconds(size)
     if config.rate > most:
@@ -145,7 +145,7 @@ def _radio(
 
     def make(config: LinkConfig) -> TransportLink:
         rates, thrust = _maps(config)
-        return ChannelLink(_wire(config), encode, rates, thrust, config.arm_channel, telemetry())
+        return ChannelLink(_serial_port(config), encode, rates, thrust, config.arm_channel, telemetry())
 
     return make
 
@@ -154,7 +154,7 @@ def _msp(config: LinkConfig, override: bool = False) -> TransportLink:
     """Make the link to a flight controller whose only receiver is MSP, or whose receiver's sticks MSP overrides."""
     rates, thrust = _maps(config)
     simulated = config.device is None and config.port is not None
-    wire = TcpTransport(SerialOverTcp(_port(config), config.host)) if simulated else _wire(config)
+    wire = TcpTransport(SerialOverTcp(_port(config), config.host)) if simulated else _serial_port(config)
     telemetry = MspTelemetry(G_COUNTS_SITL if simulated else G_COUNTS, override)
     encode, request = (encode_sticks, OVERRIDE_REQUEST) if override else (encode_msp, MSP_REQUEST)
     always = IMU_REQUEST if config.imu else b""
@@ -163,7 +163,7 @@ def _msp(config: LinkConfig, override: bool = False) -> TransportLink:
 
 def _mavlink(config: LinkConfig) -> TransportLink:
     thrust = given(config.thrust, "thrust", f"the link {config.name}")
-    return MavlinkLink(_wire(config) if config.device is not None else _datagrams(config), thrust)
+    return MavlinkLink(_serial_port(config) if config.device is not None else _datagrams(config), thrust)
 
 
 LINKS: dict[str, Callable[[LinkConfig], TransportLink]] = {
@@ -202,10 +202,10 @@ def _datagrams(config: LinkConfig, default_port: int | None = None) -> Transport
     return UdpTransport(config.host, _port(config, default_port))
 
 
-def _wire(config: LinkConfig) -> Transport:
-    return SerialPort(given(config.device, "device", f"the link {config.name}"), _wire_settings(config))
+def _serial_port(config: LinkConfig) -> Transport:
+    return SerialPort(given(config.device, "device", f"the link {config.name}"), _serial_settings(config))
 
 
-def _wire_settings(config: LinkConfig) -> SerialSettings:
+def _serial_settings(config: LinkConfig) -> SerialSettings:
     settings = PROTOCOLS[config.name]
     return settings if config.baud is None else settings._replace(baud=config.baud)

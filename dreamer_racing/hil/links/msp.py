@@ -131,12 +131,12 @@ class MspTelemetry(Telemetry):
         """Return why the flight controller does not, or would not, follow commands; empty if no reason is known."""
         status = self.status
         if self._override:
-            return self._taken_back()
+            return self._override_refusal()
         if status is None or status.armed:
             return ""
         return status.words or ("it has not armed and gives no reason: is arm_channel= its switch?" if armed else "")
 
-    def _taken_back(self) -> str:
+    def _override_refusal(self) -> str:
         """Return why the pilot or the modes prevent the override; empty if nothing does."""
         status, boxes = self.status, self.boxes
         if status is None or boxes is None:

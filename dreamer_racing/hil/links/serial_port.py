@@ -82,7 +82,7 @@ class SerialPort:
         waiting = self._waiting()
         stuck = waiting > BACKLOG * len(data) or 0 < self._left <= waiting
         if stuck:
-            self._throw_away()
+            self._discard_output()
         self._left = len(data) if stuck else 0
         try:
             # Not pyserial's own write, which retries until the buffer has room.
@@ -92,7 +92,7 @@ class SerialPort:
         except OSError as error:
             raise OSError(f"device={self._device}: it is gone: {error.strerror}.") from error
         if written < len(data):
-            self._throw_away()
+            self._discard_output()
         return written == len(data) and not stuck
 
     def discard(self) -> None:
@@ -101,7 +101,7 @@ class SerialPort:
         Raises:
             OSError: The device is gone.
         """
-        self._throw_away()
+        self._discard_output()
 
     def read(self) -> Iterator[tuple[float, bytes]]:
         """Yield the bytes in the buffer, if there are any, with the time now, s (``time.monotonic``).
@@ -125,7 +125,7 @@ class SerialPort:
                 return 0
             raise OSError(f"device={self._device}: it is gone: {error.strerror}.") from error
 
-    def _throw_away(self) -> None:
+    def _discard_output(self) -> None:
         import termios
 
         try:

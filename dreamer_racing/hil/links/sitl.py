@@ -58,10 +58,10 @@ class SitlTransport:
         self._written += 1
         if request and self._serial.write(request) and self._asked_at is None:
             self._asked_at = time.monotonic()
-        self._look()
+        self._check_boot()
         return self._boots is None and self._channels.write(data)
 
-    def _look(self) -> None:
+    def _check_boot(self) -> None:
         """Check whether the firmware has booted."""
         if self._boots is None or self._asked_at is None:
             return

@@ -28,7 +28,7 @@ _BODY = struct.Struct("<4sIdB4d")
 _CHECK = struct.Struct("<I")
 PACKET_SIZE = _BODY.size + _CHECK.size
 """Bytes of a packet: 53."""
-_PASSING = {
+_TRANSIENT_ERRORS = {
     errno.EAGAIN,
     errno.ECONNREFUSED,
     errno.ENOBUFS,
@@ -104,7 +104,7 @@ class UdpTransport:
         try:
             return self._send(data) and heard
         except OSError as error:
-            if error.errno not in _PASSING:
+            if error.errno not in _TRANSIENT_ERRORS:
                 raise
             return False
 
@@ -131,7 +131,7 @@ class UdpTransport:
             except BlockingIOError:
                 return
             except OSError as error:
-                if error.errno not in _PASSING:
+                if error.errno not in _TRANSIENT_ERRORS:
                     raise
                 self._heard = False
                 return
