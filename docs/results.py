@@ -77,8 +77,7 @@ FOOT = """## Where the numbers come from
 
 The commands on this page use today's defaults; the original ones are behind *Commands, commits, machine*. Before commit
 2c16a57 latent PPO was called `recipes/dreamer_v3.py`, so a `dreamer_v3.py` of those commits is latent PPO.
-`./dev python docs/results.py` writes this page from the `provenance.json` files in [results/](../results). Change
-those."""
+`./dev python docs/results.py` writes this page from the `provenance.json` files in [results/](../results)."""
 
 
 @dataclass
