@@ -43,7 +43,7 @@ NOT_RECORDED, NOT_RUN = "not recorded", "not run"
 HEAD = """# Results
 
 How well each algorithm flies here, what that took, and the command that runs it again. [What we know](what_we_know.md)
-draws the conclusions. To check a number, fly the included Kidney agent 2 × 100 times (40 s of CPU):
+draws the conclusions. To check a number, the 100 and 98 % of [kidney](agents.md), fly it 2 × 100 times (40 s):
 
 ```bash
 ./dev python recipes/evaluate.py checkpoint=kidney episodes=100 num_envs=100 start_noise=1 seed=7
