@@ -147,7 +147,7 @@ def test_there_are_as_many_minibatches_as_were_asked_for(minibatches: int, steps
 
 
 def test_more_minibatches_than_records_are_refused() -> None:
-    with pytest.raises(ValueError, match="minibatches=49 of 48 records"):
+    with pytest.raises(ValueError, match="minibatches=49: must be at most 48"):
         PPOLearner(SMALL, NUMBERS, PPOConfig(minibatches=49), seed=0).update(random_rollout(num_envs=4, steps=12))
 
 
