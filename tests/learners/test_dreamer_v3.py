@@ -186,7 +186,7 @@ def test_state_of_another_loss_is_refused(first, second):
     ids=["actions", "pixels", "numbers"],
 )
 def test_state_of_another_environment_is_refused(there, here):
-    assert_refused(made_with("reconstruction", 1, **there), made_with("reconstruction", 2, **here), "other observations")
+    assert_refused(made_with("reconstruction", 1, **there), made_with("reconstruction", 2, **here), "observations")
 
 
 def test_names_and_shapes_of_networks_stay_those_that_agents_ship_with():
