@@ -103,7 +103,7 @@ def export(config: ExportConfig) -> None:
     checkpoint = find_trained(config.checkpoint)
     trained = trained_config(config_folder(checkpoint))
     if not isinstance(trained, WorldModelRunConfig):
-        raise ValueError(f"{checkpoint} was trained by {trained.algorithm}; only dreamer_v3 and latent_ppo are exported.")
+        raise ValueError(f"{checkpoint} was trained by {trained.algorithm}; exported are dreamer_v3 and latent_ppo.")
     if not is_race(trained):
         raise ValueError(f"{checkpoint} was trained on {trained.task}; this recipe exports actors that race.")
     if trained.track_description is None:  # also for runs from before it was noted
