@@ -43,15 +43,19 @@ NOT_RECORDED, NOT_RUN = "not recorded", "not run"
 HEAD = """# Results
 
 How well each algorithm flies here, what that took, and the command that runs it again. [What we know](what_we_know.md)
-draws the conclusions. To check a number, the 100 and 98 % of [kidney](agents.md), fly it 2 × 100 times (40 s):
+draws the conclusions.
+"""
+CHECK = """## Check a number
+
+The agent [kidney](agents.md) has 100 %, sampled 98 %. Fly it 2 × 100 times (40 s):
 
 ```bash
 ./dev python recipes/evaluate.py checkpoint=kidney episodes=100 num_envs=100 start_noise=1 seed=7
 ```
 
 You should see two blocks with these lines; the numbers differ a little between processors. Files go to
-`runs/agent_kidney/evaluation`.
-Unless a table says otherwise, all runs were evaluated like this at their end (`checkpoint=runs/RUN`).
+`runs/agent_kidney/evaluation`. All runs on this page were evaluated like this at their end (`checkpoint=runs/RUN`), unless a
+table says otherwise.
 
 ```text
 deterministic policy, 100 episodes
@@ -64,8 +68,7 @@ lap time           best 3.96 s, mean 4.06 s (297 laps)
 
 | word | meaning on this page |
 |---|---|
-| success | share of flights that finish three laps, each from another randomised start, by the deterministic policy |
-| … of 100 flights | 97 % means 92 to 99 %, 55 % means 45 to 64 % (95 % intervals) |
+| success | of the deterministic policy; of 100 flights, 97 % means 92 to 99 %, 55 % means 45 to 64 % (95 % intervals) |
 | sampled | success of the stochastic policy, whose actions are samples from its distribution |
 | last weights | the averaged ones (`model.average_rate`), as in flight |
 | lap | mean over all complete laps, the first from rest, also of flights that crash later |
@@ -135,7 +138,7 @@ def make_page(results: Path) -> str:
     entries.sort(key=lambda entry: (min(map(known.index, entry.fills), default=len(known)), not entry.headline))
     long = [entry_text(entry, results) for entry in entries if not entry.brief]
     brief = [entry for entry in entries if entry.brief and entry.result]  # the others are shown on pages of their own
-    parts = [HEAD, *tables, *headline_text(entries), *long, *brief_text(brief, results), FOOT]
+    parts = [HEAD, *tables, CHECK, *headline_text(entries), *long, *brief_text(brief, results), FOOT]
     return "\n".join(parts).rstrip("\n") + "\n"
 
 

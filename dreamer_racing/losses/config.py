@@ -67,6 +67,7 @@ class LossConfig:
         image_share: Share of a window's records, at least one, whose images are decoded; drawn at random in each
             update. The reference decodes all; fewer make an update cheaper.
         privileged_scale: Weight of decoding the simulator's state in ``informed`` and ``privileged``.
+            At 1 the KL divergence stays at 1.6 nats and the state is predicted far worse.
         barlow_scale: Weight of the redundancy reduction in ``decoder_free``.
         drift_scale: Weight of ``policy_drift``; needs stored latents that are not sampled (``replay.context=true``,
             ``model.sampled=false``). 0 turns it off.
@@ -88,7 +89,7 @@ class LossConfig:
     free_nats: float = setting(1.0, NOT_NEGATIVE)
     image_scale: float = setting(1.0, NOT_NEGATIVE)
     image_share: float = setting(1.0, POSITIVE_SHARE)
-    privileged_scale: float = setting(1.0, NOT_NEGATIVE)
+    privileged_scale: float = setting(50.0, NOT_NEGATIVE)
     barlow_scale: float = setting(0.05, NOT_NEGATIVE)
     drift_scale: float = setting(0.0, NOT_NEGATIVE)
     slow_critic_scale: float = setting(1.0, NOT_NEGATIVE)

@@ -147,7 +147,7 @@ def print_tuned(config: DictConfig) -> None:
         files_hint = f"recipes/config/tuned/{config.tuned}.yaml and tuned/{config.algorithm} have all values"
         first = f"settings: tuned={config.tuned}, for {NAMES[config.algorithm]} {description[0]}"
         print("\n  ".join((first, *description[1:], files_hint)))
-        if changed := changed_from_tuned(config):
+        if changed := changed_from_tuned(config, files):
             print(f"settings that differ from tuned={config.tuned} (its values in brackets): {', '.join(changed)}")
         print(f"length: {config.total_env_steps:,} env_steps; the progress shows the measured time left")
 
@@ -158,8 +158,12 @@ def head_of(file: Path) -> list[str]:
     return [line[2:] for line in takewhile(lambda line: line.startswith("# "), lines)]
 
 
-def changed_from_tuned(config: DictConfig) -> list[str]:
-    """Return ``setting=value (tuned value)`` for each setting of the group `tuned` with another value here."""
+def changed_from_tuned(config: DictConfig, files: list[Path]) -> list[str]:
+    """Return ``setting=value (tuned value)`` for each setting of the group `tuned` with another value here.
+
+    These are the settings that its files name, and those in which it differs from ``tuned=none``.
+    """
+    named = {name for file in files if file.exists() for name in settings_of(OmegaConf.load(file))}
     started = GlobalHydra.instance().is_initialized()  # in a running recipe
     with nullcontext() if started else hydra.initialize_config_dir(str(CONFIG_DIR), version_base="1.3"):
         tuned = settings_of(hydra.compose(config.algorithm, [f"tuned={config.tuned}"]))
@@ -168,7 +172,7 @@ def changed_from_tuned(config: DictConfig) -> list[str]:
     return [
         f"{name}={format_value(here[name])} ({format_value(value)})"
         for name, value in tuned.items()
-        if value not in (plain[name], here[name]) and name != "tuned"
+        if value != here[name] and (value != plain[name] or name in named) and name != "tuned"
     ]
 
 

@@ -199,7 +199,7 @@ def test_tuned_images_shows_no_network_the_state_in_training() -> None:
     assert {name for name, _ in changed} == {
         "tuned", "total_env_steps", "env.start_on_line", "env.start_at_gate", "model.replay_ratio",
         "loss.world_model", "loss.critic", "loss.image_scale", "loss.image_share", "loss.free_nats",
-        "loss.privileged_scale", "schedule.start_on_line.to",
+        "schedule.start_on_line.to",
     }  # fmt: skip
     assert compose("dreamer_v3", "tuned=images", "loss=informed").loss.world_model == "informed"
 
@@ -414,9 +414,11 @@ def test_settings_that_differ_from_a_derived_tuned_file_are_printed(capsys: pyte
     told = capsys.readouterr().out
     assert "settings: tuned=images, for latent PPO on Circle from images alone" in told
     assert "settings that differ" not in told and "length: 2,500,000 env_steps" in told
-    recipe.resolve(compose("latent_ppo", "tuned=images", "device=cpu", "env.control_rate=50", "loss.image_scale=1"))
+    changed = ["env.control_rate=50", "loss.image_scale=1", "env.start_on_line=0.7"]
+    recipe.resolve(compose("latent_ppo", "tuned=images", "device=cpu", *changed))
     (line,) = (line for line in capsys.readouterr().out.splitlines() if "settings that differ" in line)
     assert "env.control_rate=50.0 (25.0)" in line and "loss.image_scale=1.0 (0.003)" in line
+    assert "env.start_on_line=0.7 (0.0)" in line, "the file sets the value that tuned=none has, too"
 
 
 def test_settings_are_said_of_the_algorithm_that_is_trained(capsys: pytest.CaptureFixture[str]) -> None:
