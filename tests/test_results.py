@@ -89,7 +89,7 @@ def test_a_planned_table_may_have_a_picture_below_it(results, folder):
     (table,) = json.loads((folder / "planned.json").read_text())
     table["picture"] = {"file": "docs/media/curves.png", "caption": "All curves."}
     (folder / "planned.json").write_text(json.dumps([table]))
-    assert "[One: a result](#one-a-result) |\n\n![All curves.](../docs/media/curves.png)" in results.make_page(folder)
+    assert "[One: a result](#one-a-result) |\n\n![All curves.](../docs/media/curves.png)\n*All curves.*\n" in results.make_page(folder)
 
 
 def test_brief_entries_are_rows_of_the_last_table(results, folder):
@@ -106,21 +106,12 @@ def test_the_page_prints_what_starts_it_today_and_links_what_was_run(results, fo
     assert f"[Commands, commits, machine](../{folder.name}/one/deep/provenance.json)." in page
 
 
-def test_headlines_are_the_second_table_and_link_to_their_sections(results, folder):
-    assert "## Other trainings" not in results.make_page(folder)
-    row = {"result": "PPO", "value": "99 %", "seeds": "2", "minutes": "3", "command": "`ppo.py`"}
-    change(folder, headline=[row])
-    page = results.make_page(folder)
-    assert "| [PPO](#one-a-result) | 99 % | 2 | 3 | `ppo.py` |" in page
-    assert page.index("## Planned") < page.index("## Other trainings")
-
-
 def test_many_files_are_linked_by_their_folder(results, folder):
     names = [f"{name}.csv" for name in "abcd"]
     for name in names:
         (folder / "one" / "deep" / name).touch()
     change(folder, files=names)
-    assert f"Numbers: [4 files](../{folder.name}/one/deep)." in " ".join(results.make_page(folder).split())
+    assert f"Numbers: [{folder.name}/one/deep](../{folder.name}/one/deep)." in " ".join(results.make_page(folder).split())
 
 
 def test_commands_are_not_broken_within_quotes(results):
@@ -141,7 +132,7 @@ def test_long_lines_are_broken_and_tables_are_not(results, folder):
 def test_pictures_are_shown_and_numbers_linked(results, folder):
     page = results.make_page(folder)
     place = f"../{folder.name}/one/deep"
-    assert f"![A curve]({place}/curve.png)" in page and f"[numbers.json]({place}/numbers.json)." in page
+    assert f"![A curve]({place}/curve.png)\n*A curve*\n" in page and f"[numbers.json]({place}/numbers.json)." in page
 
 
 @pytest.mark.parametrize(
