@@ -39,22 +39,23 @@ HEAD = """# Results
 
 How well each algorithm flies here, what that took, and the command that runs it again. In short:
 
-- **Use latent PPO.** With the true state in training it has 97 to 100 % on three tracks, two seeds each, after about 80 minutes of
-  one core, 33 if it computes in bfloat16: `OMP_NUM_THREADS=1 ./dev python recipes/latent_ppo.py track=figure8 device=cpu`.
+- **Use latent PPO.** With the true state in training it has 97 to 100 % on three tracks, two seeds each, after about 80
+  minutes of one core, 33 if it computes in bfloat16:
+  `OMP_NUM_THREADS=1 ./dev python recipes/latent_ppo.py track=figure8 device=cpu`.
 - **DreamerV3** learns in imagination. It races Circle and Kidney with its default settings, Figure 8 with others.
 - **Without the true state** only latent PPO raced, and only Circle.
 - **PPO and SAC from images** were not trained long enough to judge. PPO from the true state races in 12 minutes.
 """
 SURE = """## How sure, and what is not shown
 
-- **Flights.** Of 100, 100 % means 96 to 100 %, 97 % means 92 to 99 %, 55 % means 45 to 64 % (95 % intervals), for *this* trained
-  agent. The starts of the 100 flights were never used in training.
-- **Seeds.** One or two runs do not say how the next one goes: seeds first have 90 % up to 300,000 env_steps apart. Another
-  processor rounds differently, which acts like another seed.
-- **First 90 %** is the first evaluation with it, of 60 flights, every 100,000 env_steps (Circle by DreamerV3 and images alone:
-  50,000). So 0.4 means between 0.3 and 0.4.
-- **Not shown:** a real drone; DreamerV3 on Figure 8 by settings fixed in advance; an agent of images alone on any track but Circle;
-  today's settings on a GPU; the paper's 20 million env_steps. [More](what_we_know.md#what-is-not-known).
+- **Flights.** Of 100, 100 % means 96 to 100 %, 97 % means 92 to 99 %, 55 % means 45 to 64 % (95 % intervals), for
+  *this* trained agent. The starts of the 100 flights were never used in training.
+- **Seeds.** One or two runs do not say how the next one goes: seeds first have 90 % up to 300,000 env_steps apart.
+  Another processor rounds differently, which acts like another seed.
+- **First 90 %** is the first evaluation with it, of 60 flights, every 100,000 env_steps (Circle by DreamerV3 and images
+  alone: 50,000). So 0.4 means between 0.3 and 0.4.
+- **Not shown:** a real drone; DreamerV3 on Figure 8 by settings fixed in advance; an agent of images alone on any
+  track but Circle; today's settings on a GPU; the paper's 20 million env_steps. [More](what_we_know.md#what-is-not-known).
 """
 CHECK = """## Check a number
 
@@ -64,8 +65,9 @@ The agent [kidney](agents.md) had 100 %, sampled 98 %, on another processor. Fly
 ./dev python recipes/evaluate.py checkpoint=kidney episodes=100 num_envs=100 start_noise=1 seed=7
 ```
 
-You should see two blocks with these lines; a few flights differ between processors. Files go to `runs/agent_kidney/evaluation`.
-All runs on this page were evaluated like this at their end (`checkpoint=runs/RUN`), unless a table says otherwise.
+You should see two blocks with these lines; a few flights differ between processors. Files go to
+`runs/agent_kidney/evaluation`. All runs on this page were evaluated like this at their end (`checkpoint=runs/RUN`),
+unless a table says otherwise.
 
 ```text
 deterministic policy, 100 episodes
@@ -82,7 +84,7 @@ lap time           best 3.96 s, mean 4.06 s (297 laps)
 | sampled | success of the stochastic policy, whose actions are samples from its distribution |
 | last weights | the averaged ones (`model.average_rate`), as in flight |
 | lap | mean over all complete laps, the first from rest, also of flights that crash later |
-| minutes | of one core, for the whole training; speeds of the CPUs differ by a factor of two. For comparisons take env_steps |
+| minutes | of one core, for the whole training; CPUs differ by a factor of two in speed, so compare env_steps |
 | `schedule.NAME` | moves setting NAME as more gates are passed ([clock `known`](recipes.md#options)) |
 """
 FOOT = """## Where the numbers come from

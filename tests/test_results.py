@@ -89,7 +89,10 @@ def test_a_planned_table_may_have_a_picture_below_it(results, folder):
     (table,) = json.loads((folder / "planned.json").read_text())
     table["picture"] = {"file": "docs/media/curves.png", "caption": "All curves."}
     (folder / "planned.json").write_text(json.dumps([table]))
-    assert "[One: a result](#one-a-result) |\n\n![All curves.](../docs/media/curves.png)\n*All curves.*\n" in results.make_page(folder)
+    assert (
+        "[One: a result](#one-a-result) |\n\n![All curves.](../docs/media/curves.png)\n*All curves.*\n"
+        in results.make_page(folder)
+    )
 
 
 def test_brief_entries_are_rows_of_the_last_table(results, folder):
@@ -111,7 +114,9 @@ def test_many_files_are_linked_by_their_folder(results, folder):
     for name in names:
         (folder / "one" / "deep" / name).touch()
     change(folder, files=names)
-    assert f"Numbers: [{folder.name}/one/deep](../{folder.name}/one/deep)." in " ".join(results.make_page(folder).split())
+    assert f"Numbers: [{folder.name}/one/deep](../{folder.name}/one/deep)." in " ".join(
+        results.make_page(folder).split()
+    )
 
 
 def test_commands_are_not_broken_within_quotes(results):
