@@ -55,7 +55,7 @@ SURE = """## How sure, and what is not shown
 - **First 90 %** is the first evaluation with it, of 60 flights, every 100,000 env_steps (Circle by DreamerV3 and images
   alone: 50,000). So 0.4 means between 0.3 and 0.4.
 - **Not shown:** a real drone; DreamerV3 on Figure 8 by settings fixed in advance; an agent of images alone on any
-  track but Circle; today's settings on a GPU; the paper's 20 million env_steps. [More](what_we_know.md#what-is-not-known).
+  track but Circle; today's settings on a GPU; 20 million env_steps. [More](what_we_know.md#what-is-not-known).
 """
 CHECK = """## Check a number
 
