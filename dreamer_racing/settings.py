@@ -185,6 +185,16 @@ def suggestion(word: object, known: Collection[str]) -> str:
     return f" (did you mean {close[0]}?)" if close else ""
 
 
+def check_choice(name: str, value: object, known: Collection[str]) -> None:
+    """Refuse a value that is not one of the known ones.
+
+    Raises:
+        ValueError: The message has the setting's name, the known values, and one that may have been meant.
+    """
+    if value not in known:
+        raise ValueError(f"{name}={value}: must be one of {', '.join(known)}{suggestion(value, known)}.")
+
+
 def import_own(name: str, asked: str) -> Any:
     """Import a user's class or function.
 

@@ -35,7 +35,7 @@ from dreamer_racing.figures.hud import caption, race_words
 from dreamer_racing.figures.protocol import plot_conditions, plot_crashes
 from dreamer_racing.figures.report import EvaluationReport
 from dreamer_racing.figures.top_down import plot_top_down
-from dreamer_racing.settings import COUNT, NOT_NEGATIVE, SEED, setting
+from dreamer_racing.settings import COUNT, NOT_NEGATIVE, SEED, check_choice, setting
 from dreamer_racing.terminal import say
 from dreamer_racing.training.directory import EVALUATION, RunDirectory, fresh_directory, replace_text
 
@@ -55,8 +55,7 @@ class EvaluateConfig(FlightConfig):
 
     def check(self) -> None:
         """Refuse an unknown protocol, and noise that would be ignored."""
-        if self.protocol not in PROTOCOLS:
-            raise ValueError(f"protocol={self.protocol}: there are {', '.join(PROTOCOLS)}.")
+        check_choice("protocol", self.protocol, PROTOCOLS)
         if self.protocol == "full" and self.start_noise:
             raise ValueError(
                 f"start_noise={self.start_noise} is for protocol=nominal: protocol=full has noise among its conditions."

@@ -30,7 +30,7 @@ from hydra.types import RunMode
 from omegaconf import MISSING, ListConfig
 from yaml import YAMLError, safe_load
 
-from dreamer_racing.settings import shortened
+from dreamer_racing.settings import check_choice, shortened
 from dreamer_racing.training.directory import RunDirectory, latest_checkpoint
 
 FOLDER = Path(__file__).resolve().parent
@@ -78,8 +78,7 @@ def main(settings: ExperimentConfig) -> None:
 def check(config: ExperimentConfig) -> None:
     """Refuse an unknown algorithm or variant."""
     for name, known in (("algorithm", tuple(RECIPES)), ("variant", tuple(config.variants))):
-        if (value := getattr(config, name)) not in known:
-            raise ValueError(f"{name}={value}: there are {', '.join(known)}.")
+        check_choice(name, getattr(config, name), known)
 
 
 def directory_of(config: ExperimentConfig) -> Path:

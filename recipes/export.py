@@ -55,7 +55,7 @@ from dreamer_racing.export.shipped_agent import (
     load_agent,
 )
 from dreamer_racing.modules import Interface
-from dreamer_racing.settings import COUNT, SEED, setting
+from dreamer_racing.settings import COUNT, SEED, check_choice, setting
 from dreamer_racing.training.directory import RunDirectory
 
 BY_ITEM = ("episodes", "crashes_by_gate")  # entries of an evaluation that agent.json leaves out
@@ -98,8 +98,7 @@ def main(config: ExportConfig) -> None:
 
 def export(config: ExportConfig) -> None:
     """Export the actor and print the results."""
-    if config.latent not in LATENTS:
-        raise ValueError(f"latent={config.latent}: there are {' and '.join(LATENTS)}.")
+    check_choice("latent", config.latent, LATENTS)
     checkpoint = find_trained(config.checkpoint)
     trained = trained_config(config_folder(checkpoint))
     if not isinstance(trained, WorldModelRunConfig):

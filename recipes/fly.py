@@ -46,7 +46,7 @@ from dreamer_racing.figures.chase import chase_beside_onboard
 from dreamer_racing.figures.film import enlarge_to_watch, onboard_beside_map, write_gif, write_video
 from dreamer_racing.figures.hud import caption, laps_completed, race_words
 from dreamer_racing.figures.top_down import plot_top_down
-from dreamer_racing.settings import COUNT, SEED, setting
+from dreamer_racing.settings import COUNT, SEED, check_choice, setting
 from dreamer_racing.terminal import say
 from dreamer_racing.training.directory import EVALUATION
 
@@ -87,16 +87,15 @@ class FlyConfig:
         """
         if self.agent is not None and self.pilot is not None:
             raise ValueError(f"pilot={self.pilot} and agent={self.agent}: give one of them.")
-        if self.pilot not in (None, *PILOTS, *KINDS):
-            raise ValueError(f"pilot={self.pilot}: there are {', '.join((*PILOTS, *KINDS))}.")
+        if self.pilot is not None:
+            check_choice("pilot", self.pilot, (*PILOTS, *KINDS))
         if self.pilot in KINDS:
             if self.viewer:
                 raise ValueError(
                     f"viewer=true and pilot={self.pilot}, which has a window of its own: give one of them."
                 )
             check_by_hand(self.pilot)
-        if self.view not in VIEWS:
-            raise ValueError(f"view={self.view}: there are {', '.join(VIEWS)}.")
+        check_choice("view", self.view, VIEWS)
         if self.viewer and self.view == "chase":
             raise ValueError("viewer=true and view=chase, which films the flight: give one of them.")
         if self.viewer:

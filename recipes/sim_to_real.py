@@ -27,7 +27,7 @@ from dreamer_racing.hil.flyer import ActorFlyer, Flyer, check_contract, trained_
 from dreamer_racing.machine import available_cpus, provenance
 from dreamer_racing.plant.pilot import PilotFlyer
 from dreamer_racing.plant.study import SWEEPS, study
-from dreamer_racing.settings import COUNT, Range, setting
+from dreamer_racing.settings import COUNT, Range, check_choice, setting
 from dreamer_racing.terminal import say
 
 PILOT = "pilot"
@@ -91,8 +91,8 @@ def check(config: SimToRealConfig) -> tuple[Track, Callable[[], Flyer]]:
         OSError: there is no such actor.
     """
     load_preset(config.preset)
-    if unknown := sorted(set(config.sweeps or ()) - set(SWEEPS)):
-        raise ValueError(f"sweeps={unknown[0]}: there are {', '.join(SWEEPS)}.")
+    for name in config.sweeps or ():
+        check_choice("sweeps", name, SWEEPS)
     if config.actor == PILOT:
         if config.track is None:
             raise ValueError("track= is missing: actor=pilot has none of its own.")

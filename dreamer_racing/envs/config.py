@@ -13,7 +13,7 @@ from dreamer_racing.envs.race.gates import GateSweeper
 from dreamer_racing.envs.simulator.scene import Camera, frame_interval
 from dreamer_racing.envs.tracks import Track
 from dreamer_racing.envs.worlds import ACTION_SIZE, RaceWorlds
-from dreamer_racing.settings import COUNT, NOT_NEGATIVE, POSITIVE, SHARE, Range, setting
+from dreamer_racing.settings import COUNT, NOT_NEGATIVE, POSITIVE, SHARE, Range, check_choice, setting
 
 SUITES = ("race", "dmc")
 ALL_SUITES = ("suite", "num_envs", "device", "episode_steps", "from_pixels", "image_size")
@@ -87,8 +87,7 @@ class EnvConfig:
         Raises:
             ValueError: the message names the setting.
         """
-        if self.suite not in SUITES:
-            raise ValueError(f"env.suite={self.suite}: must be one of {', '.join(SUITES)}.")
+        check_choice("env.suite", self.suite, SUITES)
         race, on_cuda = self.suite == "race", self.device.partition(":")[0] == "cuda"
         if not on_cuda and self.device != "cpu":
             raise ValueError(f"env.device={self.device}: must be cpu, cuda, cuda:1 ..., or auto.")

@@ -40,7 +40,7 @@ from dreamer_racing.envs.simulator.rendering import Renderer, make_renderer
 from dreamer_racing.envs.simulator.scene import build_scene
 from dreamer_racing.envs.tracks import Track
 from dreamer_racing.envs.worlds import ACTION_SIZE, RaceWorlds, WorldOptions, check_options
-from dreamer_racing.settings import FINITE, check_flags, check_setting
+from dreamer_racing.settings import FINITE, check_choice, check_flags, check_setting
 
 RENDER_VIEWS = ("chase", "onboard")
 OBSERVATIONS = ("pixels", "pixels_imu", "pixels_vector", "vector", "state", "both")
@@ -113,12 +113,10 @@ class GymWorlds:
         worlds: WorldOptions,
     ) -> None:
         check_flags(privileged=privileged)
-        if observation not in OBSERVATIONS:
-            raise ValueError(f"observation={observation!r}: choose one of {', '.join(OBSERVATIONS)}.")
+        check_choice("observation", observation, OBSERVATIONS)
         if render_mode not in (None, "rgb_array"):
             raise ValueError(f"render_mode={render_mode!r}: choose 'rgb_array', or None for no frames.")
-        if render_view not in RENDER_VIEWS:
-            raise ValueError(f"render_view={render_view!r}: choose one of {', '.join(RENDER_VIEWS)}.")
+        check_choice("render_view", render_view, RENDER_VIEWS)
         if body_rate_weight is not None:
             check_setting("body_rate_weight", body_rate_weight, FINITE)
         device = worlds.get("device", "cpu")

@@ -22,6 +22,7 @@ from dreamer_racing.export.onnx_actor import CONTRACT, PARTS, read_contract
 from dreamer_racing.export.weights_file import read_weights
 from dreamer_racing.modules import DreamerPolicy, Interface, ModelSize
 from dreamer_racing.modules.agent import Agent
+from dreamer_racing.settings import check_choice
 from dreamer_racing.training.checkpoint import load_state
 
 AGENT, CONFIG, ACTOR = "agent.json", "config.yaml", "actor.onnx"
@@ -56,8 +57,7 @@ def choose_weights(wanted: str, kept: str | tuple[str, ...], source: str | Path)
         'averaged'
     """
     kept = (kept,) if isinstance(kept, str) else kept
-    if wanted not in CHOICES:
-        raise ValueError(f"weights={wanted}: must be one of {', '.join(CHOICES)}.")
+    check_choice("weights", wanted, CHOICES)
     if wanted == "auto":
         return AVERAGED if AVERAGED in kept else TRAINED
     if wanted not in kept:

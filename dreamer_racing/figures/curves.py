@@ -16,6 +16,7 @@ from typing import NamedTuple
 import numpy as np
 
 from dreamer_racing.figures.runs import AXES, CurveKey, RunData, along, axis_of, group_runs, is_metrics, runs_below
+from dreamer_racing.settings import check_choice
 
 CURVES = "learning_curves.csv"
 POINTS = 240  # P
@@ -102,8 +103,7 @@ def wanted_columns(quantities: Sequence[str], axis: str = "env_steps") -> list[s
     """
     clock = axis_of(axis).clock
     for name in quantities:
-        if name not in QUANTITIES:
-            raise ValueError(f"quantities={name}: must be one of {', '.join(QUANTITIES)}.")
+        check_choice("quantities", name, QUANTITIES)
     columns = [QUANTITIES[name].column for name in quantities]
     beside = [name for column in columns for name in _evaluation_markers(column)]
     return [*dict.fromkeys([*columns, *beside, WEIGHT, *([clock] if clock else [])])]
@@ -137,8 +137,7 @@ def learning_curves(
         ValueError: there are no runs or values, a name is unknown, or two runs of one curve have the same seed.
     """
     wanted_columns(quantities, axis)
-    if aggregate not in AGGREGATES:
-        raise ValueError(f"aggregate={aggregate}: must be one of {', '.join(AGGREGATES)}.")
+    check_choice("aggregate", aggregate, AGGREGATES)
     if not runs:
         raise ValueError(f"there is no run to draw. {'; '.join(problems) or 'None was given.'}")
     runs, without_clock = along(runs, axis)

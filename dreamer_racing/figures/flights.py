@@ -33,6 +33,7 @@ from dreamer_racing.figures.drawing import (
 )
 from dreamer_racing.figures.film import CONTEXT_COLOR, OPEN_LOOP_COLOR, film_strip, shown_frames
 from dreamer_racing.figures.profiles import PROFILE_AXES, altitude_legend, draw_altitude, draw_speed
+from dreamer_racing.settings import check_choice
 
 TITLE_ROOM = 0.35  # space above the panels, inches
 PROFILE_HEIGHT = 1.3  # height of a profile, inches
@@ -69,8 +70,7 @@ def plot_flights(
     """
     if not flights:
         raise ValueError("no flights to draw.")
-    if over not in PROFILE_AXES:
-        raise ValueError(f"over={over}: must be one of {', '.join(PROFILE_AXES)}.")
+    check_choice("over", over, PROFILE_AXES)
     columns = min(columns, len(flights))
     rows = math.ceil(len(flights) / columns)
     half = [max(size) / 2 for size in zip(*(_floor_size(flight.track) for flight in flights), strict=True)]  # m

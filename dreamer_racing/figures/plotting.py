@@ -34,7 +34,7 @@ from dreamer_racing.figures.runs import (
     group_runs,
     read_runs,
 )
-from dreamer_racing.settings import NOT_NEGATIVE, check_settings, setting
+from dreamer_racing.settings import NOT_NEGATIVE, check_choice, check_settings, setting
 from dreamer_racing.training.directory import RunDirectory, ensure_writable
 
 
@@ -142,8 +142,7 @@ def check_plot(config: PlotConfig) -> None:
         ("flight", config.flight, FLIGHTS),
         ("over", config.over, PROFILE_AXES),
     ):
-        if value not in allowed:
-            raise ValueError(f"{name}={value}: must be one of {', '.join(allowed)}.")
+        check_choice(name, value, allowed)
     for name, files in (("flights", config.flights), ("dreams", config.dreams)):
         if missing := [str(file) for file in files if not Path(file).is_file()]:
             raise ValueError(f"{name}={missing[0]}: there is no such file.")

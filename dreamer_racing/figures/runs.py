@@ -17,6 +17,7 @@ import numpy as np
 import yaml
 
 from dreamer_racing.envs.tracks.loading import BUILTIN_TRACKS
+from dreamer_racing.settings import check_choice
 from dreamer_racing.training.clock import CPU_CLOCK, WALL_CLOCK
 from dreamer_racing.training.directory import RunDirectory
 from dreamer_racing.training.metrics import MetricsTable, read_metrics
@@ -62,8 +63,7 @@ def axis_of(name: str) -> Axis:
     Raises:
         ValueError: the name is unknown.
     """
-    if name not in AXES:
-        raise ValueError(f"axis={name}: must be one of {', '.join(AXES)}.")
+    check_choice("axis", name, AXES)
     return AXES[name]
 
 

@@ -13,6 +13,7 @@ from dreamer_racing.envs.simulator.scene import Camera, build_scene
 from dreamer_racing.envs.tracks import Track
 from dreamer_racing.hil.attitude import rotation_matrix
 from dreamer_racing.hil.vehicle import Pose
+from dreamer_racing.settings import check_choice
 
 
 class NoseCamera:
@@ -33,8 +34,7 @@ class NoseCamera:
     """
 
     def __init__(self, track: Track, camera: Camera, backend: str = "auto") -> None:
-        if backend not in ("auto", *GL_LIBRARIES):
-            raise ValueError(f"renderer={backend}: must be one of auto, {', '.join(GL_LIBRARIES)}.")
+        check_choice("renderer", backend, ("auto", *GL_LIBRARIES))
         model = build_scene(track, QuadrotorParameters(), camera).compile()
         reasons = []
         for candidate in GL_LIBRARIES if backend == "auto" else (backend,):

@@ -36,7 +36,7 @@ from dreamer_racing.hil.pose_sources import POSE_SOURCES, WITHOUT_VELOCITIES, Po
 from dreamer_racing.hil.safety import SafetyLimits
 from dreamer_racing.hil.stamping import Stamping
 from dreamer_racing.hil.sticks import FIRST_SWITCH, ThrustMap
-from dreamer_racing.settings import POSITIVE, Range, check_settings, setting
+from dreamer_racing.settings import POSITIVE, Range, check_choice, check_settings, setting
 
 logger = logging.getLogger(__name__)
 
@@ -136,10 +136,9 @@ def check(config: HilConfig) -> None:
             "included agent, actor=pilot track=kidney the scripted pilot."
         )
     for name, there in (("link", LINKS), ("pose", POSE_SOURCES)):
-        if (value := getattr(config, name)) is not None and value not in there:
-            raise ValueError(f"{name}={value}: must be one of {', '.join(there)}.")
-    if config.operator not in ("auto", *OPERATORS):
-        raise ValueError(f"operator={config.operator}: must be one of auto, {', '.join(OPERATORS)}.")
+        if (value := getattr(config, name)) is not None:
+            check_choice(name, value, there)
+    check_choice("operator", config.operator, ("auto", *OPERATORS))
     if config.operator == "timed" and config.link not in SIMULATED:
         raise ValueError(
             f"operator=timed gives the enable by itself, but link={config.link} may be a real vehicle: use keyboard."

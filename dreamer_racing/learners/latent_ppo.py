@@ -43,7 +43,7 @@ from dreamer_racing.modules import Agent
 from dreamer_racing.modules.heads import ActionDistribution, TwoHotHead, symlog
 from dreamer_racing.modules.interface import PRIVILEGED
 from dreamer_racing.modules.rssm import join_features
-from dreamer_racing.settings import suggestion
+from dreamer_racing.settings import check_choice
 
 CRITICS = ("latent", "state")
 """Inputs that PPO's critic may have."""
@@ -99,8 +99,7 @@ class LatentPPO(WorldModelLearner):
     def make_networks(self) -> dict[str, nn.Module]:
         """Make PPO's critic."""
         sees, interface, size = self.loss_config.critic, self.agent.interface, self.size
-        if sees not in CRITICS:
-            raise ValueError(f"Unknown critic {sees!r}{suggestion(sees, CRITICS)}. There are {', '.join(CRITICS)}.")
+        check_choice("loss.critic", sees, CRITICS)
         if sees == "state" and interface.privileged_dim < 1:
             raise ValueError(
                 "critic='state' needs the simulator's state, but the environment gives none under "

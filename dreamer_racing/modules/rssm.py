@@ -20,6 +20,7 @@ from torch.autograd.function import FunctionCtx
 
 from dreamer_racing.modules.layers import NormedLinear, SplitNormedLinear, autocast_type, linear, unrolled
 from dreamer_racing.modules.recurrent_cells import BlockGRUCell, DenseGRUCell
+from dreamer_racing.settings import check_choice
 
 StepStart = Callable[[int, Tensor, Tensor], tuple[Tensor, ...]]
 """Function of a step's index and the latents after the step before that returns the latents the step starts from."""
@@ -193,8 +194,7 @@ class RSSM(nn.Module):
     ) -> None:
         super().__init__()
         recurrence = recurrence or next(iter(self.cells))
-        if recurrence not in self.cells:
-            raise ValueError(f"{type(self).__name__}: recurrence={recurrence!r}, known here: {', '.join(self.cells)}.")
+        check_choice(f"{type(self).__name__}: recurrence", recurrence, self.cells)
         self.latents, self.classes, self.unimix, self.sampled = latents, classes, unimix, sampled
         self.few_kernels = False
         self.uniform = nn.Buffer(torch.tensor(1.0 / classes), persistent=False)

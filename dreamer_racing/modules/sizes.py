@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 
+from dreamer_racing.settings import check_choice
+
 
 @dataclass(frozen=True)
 class ModelSize:
@@ -171,6 +173,5 @@ def get_size(size: ModelSize | str) -> ModelSize:
     """
     if isinstance(size, ModelSize):
         return size
-    if size not in SIZES:
-        raise ValueError(f"Unknown model size {size!r}. Known sizes: {', '.join(SIZES)}.")
+    check_choice("model", size, SIZES)
     return SIZES[size]

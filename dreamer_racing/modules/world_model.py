@@ -16,6 +16,7 @@ from dreamer_racing.modules.interface import Interface
 from dreamer_racing.modules.parallel_rssm import ParallelRSSM
 from dreamer_racing.modules.rssm import RSSM, Posterior
 from dreamer_racing.modules.sizes import ModelSize, get_size
+from dreamer_racing.settings import check_choice
 
 RSSMS: dict[str, type[RSSM]] = {recurrence: kind for kind in (RSSM, ParallelRSSM) for recurrence in kind.cells}
 """RSSM classes by ``ModelSize.recurrence``."""
@@ -50,10 +51,7 @@ class WorldModel(nn.Module):
         size, interface = get_size(size), interface or Interface()
         self.size, self.interface = size, interface
         self.encoder = ObservationEncoder(size, interface)
-        if size.recurrence not in RSSMS:
-            raise ValueError(
-                f"Model size {size.name!r} has recurrence={size.recurrence!r}; there are {', '.join(RSSMS)}."
-            )
+        check_choice(f"model size {size.name}: recurrence", size.recurrence, RSSMS)
         self.rssm = RSSMS[size.recurrence](
             self.encoder.embedding_size,
             interface.action_dim,

@@ -114,7 +114,7 @@ def no_such_setting(name: str, recipe: str) -> str:
 
 def no_such_choice(group: str, choice: str, choices: Sequence[str]) -> str:
     """Return a message that a group has no such choice, with those that it has."""
-    return f"{group}={choice}: there are {', '.join(choices)}{settings.suggestion(choice, choices)}."
+    return f"{group}={choice}: must be one of {', '.join(choices)}{settings.suggestion(choice, choices)}."
 
 
 def check_arguments(recipe: str, arguments: Sequence[str]) -> None:

@@ -163,7 +163,7 @@ def changed_from_tuned(config: DictConfig, files: list[Path]) -> list[str]:
 
     These are the settings that its files name, and those in which it differs from ``tuned=none``.
     """
-    named = {name for file in files if file.exists() for name in settings_of(OmegaConf.load(file))}
+    named = {name for file in files if file.exists() for name in settings_of(cast(DictConfig, OmegaConf.load(file)))}
     started = GlobalHydra.instance().is_initialized()  # in a running recipe
     with nullcontext() if started else hydra.initialize_config_dir(str(CONFIG_DIR), version_base="1.3"):
         tuned = settings_of(hydra.compose(config.algorithm, [f"tuned={config.tuned}"]))

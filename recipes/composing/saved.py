@@ -42,7 +42,7 @@ def saved_config(run_dir: Path) -> DictConfig:
     path = RunDirectory(run_dir).config
     saved = read_yaml(path, DictConfig)
     if (algorithm := str(saved.get("algorithm"))) not in RECIPES:
-        raise ValueError(f"{path}: algorithm={shortened(algorithm)}; there are {', '.join(RECIPES)}.")
+        raise ValueError(f"{path}: algorithm={shortened(algorithm)}: must be one of {', '.join(RECIPES)}.")
     try:
         config = cast(DictConfig, OmegaConf.merge(OmegaConf.structured(RECIPES[algorithm]), saved))
     except OmegaConfBaseException as error:

@@ -272,11 +272,9 @@ def test_wrong_arguments_are_explained() -> None:
         envs.step(np.zeros((2, 4)))
     with pytest.raises(ValueError, match="seed=\\[1, 2, 3\\]: must be one number"):
         envs.reset(seed=[1, 2, 3])
-    with pytest.raises(
-        ValueError, match="observation='image': choose one of pixels, pixels_imu, pixels_vector, vector"
-    ):
+    with pytest.raises(ValueError, match="observation=image: must be one of pixels, pixels_imu, pixels_vector, vector"):
         DroneRaceGymEnv(observation="image")
-    with pytest.raises(ValueError, match="render_view='front': choose one of chase, onboard"):
+    with pytest.raises(ValueError, match="render_view=front: must be one of chase, onboard"):
         DroneRaceGymEnv(render_view="front")
     with pytest.raises(ValueError, match="render_mode='human'"):
         DroneRaceVectorEnv(2, render_mode="human")

@@ -249,7 +249,7 @@ def test_evaluations_ask_the_critic_that_teaches_the_actor(critic):
 def test_what_it_needs_and_does_not_get_is_refused_by_name():
     with pytest.raises(ValueError, match=r"critic='state' needs the simulator's state.*critic='latent'"):
         latent_ppo_of("debug", Interface(), critic="state")
-    with pytest.raises(ValueError, match=r"Unknown critic 'sate' \(did you mean state\?\)"):
+    with pytest.raises(ValueError, match=r"loss.critic=sate: must be one of latent, state \(did you mean state\?\)"):
         latent_ppo_of("debug", Interface(), critic="sate")
     learner = make_learner("state")
     with pytest.raises(KeyError, match=r"lacks \[\('privileged', 'vector'\)\]"):

@@ -159,7 +159,7 @@ def test_gradient_reaches_the_first_record_but_not_across_a_reset(kind):
 
 @pytest.mark.parametrize("recurrence", ["dense", "ssm"])
 def test_unknown_recurrences_are_refused(recurrence):
-    with pytest.raises(ValueError, match=r"recurrence='lstm', known here: "):
+    with pytest.raises(ValueError, match=r"recurrence=lstm: must be one of "):
         RSSMS[recurrence](8, 4, 16, latents=3, classes=4, hidden=8, recurrence="lstm")
 
 
@@ -278,7 +278,7 @@ def test_sizes_choose_it_and_bad_ones_are_refused():
     assert isinstance(WorldModel("ssm_debug").rssm, ParallelRSSM)
     with pytest.raises(ValueError, match=r"belief=15 must divide into 2 layers"):
         DiagonalSSM(belief=15, state=6, action=4, hidden=8, norm="layer")
-    with pytest.raises(ValueError, match=r"'mine' has recurrence='mamba'; there are block, dense, ssm"):
+    with pytest.raises(ValueError, match=r"model size mine: recurrence=mamba: must be one of block, dense, ssm"):
         WorldModel(replace(get_size("debug"), name="mine", recurrence="mamba"), Interface())
 
 

@@ -140,7 +140,7 @@ def test_settings_of_which_one_would_be_ignored_are_refused(tmp_path: Path) -> N
     fly, export = map(recipe_module, ("fly", "export"))
     with pytest.raises(ValueError, match="pilot=hover and agent=kidney: give one of them"):
         fly.FlyConfig(agent="kidney", pilot="hover").check()
-    with pytest.raises(ValueError, match="pilot=human: there are scripted, hover, keyboard, gamepad"):
+    with pytest.raises(ValueError, match="pilot=human: must be one of scripted, hover, keyboard, gamepad"):
         fly.FlyConfig(pilot="human").check()
     (tmp_path / "agent.json").write_text("{}")
     for settings, words in (

@@ -76,7 +76,7 @@ def test_any_text_can_be_said_to_hydra(text: str) -> None:
         ("discont=0.9", "(did you mean loss.discount?)"),
         ("xyzzy=1", "xyzzy: there is no such setting of recipes/dreamer_v3.py. docs/options.md has them all."),
         ("model=cpu_smal", "(did you mean cpu_small?)."),
-        ("tuned=fast", "tuned=fast: there are auto, gpu, images, none, race, suite."),
+        ("tuned=fast", "tuned=fast: must be one of auto, gpu, images, none, race, suite."),
         ("total_env_steps=many", "total_env_steps=many: Value 'many' of type 'str' is not a whole number."),
         ("env.from_pixels=maybe", "env.from_pixels=maybe: Value 'maybe' is neither true nor false."),
         ("schedule.discount=0.99", "schedule.discount=0.99: a schedule is set by NAME.to="),

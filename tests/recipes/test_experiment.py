@@ -60,7 +60,7 @@ def test_failures_of_an_earlier_command_are_forgotten(tmp_path: Path) -> None:
     report = recipe_module("composing.callbacks")
     note = tmp_path / report.FAILURES / "ppo_circle_slip_seed0.txt"
     note.parent.mkdir()
-    note.write_text("variant=slip: there are default")
+    note.write_text("variant=slip: must be one of default")
     report.DrawFigures().on_multirun_start(OmegaConf.create({"hydra": {"sweep": {"dir": str(tmp_path)}}}))
     assert not note.exists()
 
@@ -122,8 +122,8 @@ def test_a_run_with_other_settings_is_not_continued(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("override", "words"),
     [
-        ("algorithm=tdmpc", "algorithm=tdmpc: there are dreamer_v3, latent_ppo, ppo, sac"),
-        ("variant=mad", "variant=mad: there are"),
+        ("algorithm=tdmpc", "algorithm=tdmpc: must be one of dreamer_v3, latent_ppo, ppo, sac"),
+        ("variant=mad", "variant=mad: must be one of"),
     ],
 )
 def test_unknown_names_are_refused(override: str, words: str, tmp_path: Path) -> None:

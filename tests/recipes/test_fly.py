@@ -113,7 +113,7 @@ def test_the_refusal_as_a_user_meets_it(tmp_path) -> None:
 
 def test_a_view_that_there_is_not_is_refused_before_the_flight() -> None:
     fly = recipe_module("fly")
-    with pytest.raises(ValueError, match=r"^view=side: there are map, chase\.$"):
+    with pytest.raises(ValueError, match=r"^view=side: must be one of map, chase\.$"):
         fly.FlyConfig(view="side").check()
     with pytest.raises(ValueError, match=r"^viewer=true and view=chase"):
         fly.FlyConfig(viewer=True, view="chase").check()

@@ -323,7 +323,7 @@ def test_an_incomplete_run_is_not_resumed(run_dir: Path, tmp_path: Path) -> None
             resumed("dreamer_v3", str(copied), [])
         assert "\n" not in str(refusal.value)
     (copied / "config.yaml").write_text("algorithm: [1]")
-    with pytest.raises(ValueError, match=r"config\.yaml: algorithm=\[1\]; there are dreamer_v3"):
+    with pytest.raises(ValueError, match=r"config\.yaml: algorithm=\[1\]: must be one of dreamer_v3"):
         recipe_module("composing.saved").trained_config(copied)
     (copied / "config.yaml").write_text(whole)
     (copied / "overrides.yaml").unlink()

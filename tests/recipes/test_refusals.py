@@ -254,7 +254,7 @@ def test_numbers_out_of_their_range_are_refused_before_anything_is_read(
 
 def test_an_unknown_protocol_is_refused() -> None:
     config = OmegaConf.to_object(compose("evaluate", "checkpoint=nowhere", "protocol=quick"))
-    with pytest.raises(ValueError, match="protocol=quick: there are nominal, full"):
+    with pytest.raises(ValueError, match="protocol=quick: must be one of nominal, full"):
         config.check()
     config = OmegaConf.to_object(compose("evaluate", "checkpoint=nowhere", "protocol=full", "start_noise=1"))
     with pytest.raises(ValueError, match="start_noise=1.0 is for protocol=nominal"):

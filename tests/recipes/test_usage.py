@@ -75,7 +75,7 @@ def test_help_loads_neither_torch_nor_hydra(name: str, flag: str, tmp_path: Path
         (
             "dreamer_v3",
             "tuned=rcae",
-            "tuned=rcae: there are auto, gpu, images, none, race, suite (did you mean race?).",
+            "tuned=rcae: must be one of auto, gpu, images, none, race, suite (did you mean race?).",
         ),
         ("dreamer_v3", "--track=kidney", "settings are written without dashes, track=kidney"),
         ("fly", "+agnt=kidney", "there is no such setting of recipes/fly.py (did you mean agent?)"),

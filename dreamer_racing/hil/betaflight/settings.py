@@ -17,6 +17,7 @@ from typing import Any, NamedTuple
 
 from dreamer_racing.hil.betaflight.status import ANGLE, ARM, HORIZON, MSP_OVERRIDE
 from dreamer_racing.hil.sticks import RateMap, ThrustMap
+from dreamer_racing.settings import check_choice
 
 AXES = {"roll": "body_rate_x", "pitch": "body_rate_y", "yaw": "body_rate_z"}
 LINKS = ("crsf", "sbus", "msp", "msp_override", "betaflight_sitl")
@@ -219,8 +220,7 @@ def _read_modes(modes: list[list[str]]) -> dict[str, str]:
 
 def _receiver(link: str) -> list[Setting]:
     """Return the settings by which the flight controller listens to a link."""
-    if link not in LINKS:
-        raise ValueError(f"link={link}: must be one of {', '.join(LINKS)}.")
+    check_choice("link", link, LINKS)
     if link == "betaflight_sitl":
         return [_MSP_RATE, *_SIMULATED]  # channels come over UDP, whichever receiver is set: see docs/hil_firmware.md
     if link == "msp_override":

@@ -38,7 +38,7 @@ from dreamer_racing.hil.links.tcp import TcpTransport
 from dreamer_racing.hil.links.telemetry import Telemetry
 from dreamer_racing.hil.links.udp import UdpLink, UdpTransport
 from dreamer_racing.hil.sticks import FIRST_SWITCH, RateMap, ThrustMap, check_arm_channel
-from dreamer_racing.settings import given
+from dreamer_racing.settings import check_choice, given
 
 
 @dataclass(frozen=True)
@@ -91,8 +91,7 @@ def make_link(config: LinkConfig) -> TransportLink:
     Example:
         >>> make_link(LinkConfig("udp", port=9100)).close()
     """
-    if config.name not in LINKS:
-        raise ValueError(f"name={config.name}: must be one of {', '.join(LINKS)}.")
+    check_choice("name", config.name, LINKS)
     if config.device is not None and config.name not in PROTOCOLS:
         raise ValueError(
             f"device={config.device} is for {', '.join(PROTOCOLS)}, but link={config.name} uses UDP: choose one of "

@@ -22,7 +22,7 @@ from dreamer_racing.hil.pose_sources import mavlink, ros2
 from dreamer_racing.hil.pose_sources.mavlink import MavlinkPose
 from dreamer_racing.hil.pose_sources.messages import SMOOTHING
 from dreamer_racing.hil.pose_sources.ros2 import Ros2Pose
-from dreamer_racing.settings import Range, check_settings, given, setting
+from dreamer_racing.settings import Range, check_choice, check_settings, given, setting
 
 
 @dataclass(frozen=True)
@@ -67,8 +67,7 @@ def make_poses(config: PoseConfig) -> PoseSource:
     Example:
         >>> make_poses(PoseConfig("udp", port=0)).close()
     """
-    if config.name not in POSE_SOURCES:
-        raise ValueError(f"name={config.name}: must be one of {', '.join(POSE_SOURCES)}.")
+    check_choice("name", config.name, POSE_SOURCES)
     return POSE_SOURCES[config.name](config)
 
 
