@@ -41,18 +41,18 @@ How well each algorithm flies here, what that took, and the command that runs it
 
 - **Use latent PPO**: `OMP_NUM_THREADS=1 ./dev python recipes/latent_ppo.py track=figure8 device=cpu`. With the true
   state in training two seeds have 99 and 100 % on Figure 8, 90 % after 47 and 56 minutes of one core, in all 79 and 84
-  (float32; bfloat16 is faster: Circle 33, `doctor.py` tells). On Circle and Kidney it has 97 to 100 %.
-- **DreamerV3** learns in imagination. It races Circle and Figure 8, where success swings, by one seed each, by an
-  earlier default Circle by two more and Kidney by one.
+  (float32; Circle took 33 in bfloat16, if `recipes/doctor.py` finds it). On Circle and Kidney it has 97 to 100 %.
+- **DreamerV3** learns in imagination. Its default races Circle and Figure 8, where success swings, one seed each. An
+  earlier default raced Circle, two seeds, and Kidney, one seed; another was cut short.
 - **Without the true state** only latent PPO raced, and only Circle.
-- **PPO and SAC from images** were not trained long enough to judge. PPO from the true state races in 12 minutes.
+- **PPO and SAC from images** were not trained long enough to judge. PPO from the true state races in 6 to 12 minutes.
 """
 SURE = """## How sure, and what is not shown
 
-- **Flights.** Of 100, 100 % means 96 to 100 %, 97 % means 92 to 99 %, 85 % means 77 to 91 % (95 % intervals), for
+- **Flights.** Of 100, 100 % means 96 to 100 %, 97 % means 92 to 99 %, 93 % means 86 to 97 % (95 % intervals), for
   *this* trained agent. The starts of the 100 flights were never used in training.
-- **Seeds.** One or two runs do not say how the next one goes: seeds first have 90 % up to 150,000 env_steps apart.
-  Another processor rounds differently, which acts like another seed.
+- **Seeds.** One or two runs do not say how the next one goes: those that had 90 % had it up to 150,000 env_steps
+  apart, and one was far behind when cut short. Another processor rounds differently, which acts like another seed.
 - **First 90 %** is the first evaluation with it, of 60 flights, every 100,000 env_steps (Circle by DreamerV3 and images
   alone: 50,000). So 0.4 means between 0.3 and 0.4.
 - **Selection.** Settings were chosen on these tracks, DreamerV3's on Circle, seeds 0 and 1, and Figure 8, seed 0.
@@ -67,7 +67,7 @@ The agent [kidney](agents.md) had 100 %, sampled 98 %, on another processor. Fly
 ./dev python recipes/evaluate.py checkpoint=kidney episodes=100 num_envs=100 start_noise=1 seed=7
 ```
 
-You should see this, and the same of the sampled policy; a few flights differ between processors. Files go to
+You should see this, then a block of the sampled policy (98 %); a few flights differ between processors. Files go to
 `runs/agent_kidney/evaluation`. All runs on this page were evaluated like this at their end (`checkpoint=runs/RUN`),
 unless a table says otherwise. Commands on this page use today's defaults; the original ones are behind *Commands,
 commits, machine*. In those before commit 2c16a57 `recipes/dreamer_v3.py` is latent PPO.
@@ -83,7 +83,7 @@ lap time           best 3.92 s, mean 4.02 s (300 laps)
 | success | share of flights that finish three laps, each from another randomised start, by the deterministic policy |
 | sampled | success of the stochastic policy, whose actions are samples from its distribution |
 | lap | mean over all complete laps, the first from rest, also of flights that crash later |
-| minutes | of one core, for the whole training; CPUs differ by a factor of two in speed, so compare env_steps |
+| minutes | of one core, if no GPU is named. CPU and bfloat16 (DreamerV3) change them 2.5-fold: compare env_steps |
 | `schedule.NAME` | moves setting NAME as more gates are passed ([clock `known`](recipes.md#options)) |
 """
 
