@@ -318,5 +318,5 @@ def test_sizes_have_their_number_of_parameters(name):
 
 
 def test_unknown_size_lists_the_known_ones():
-    with pytest.raises(ValueError, match="'huge'.*debug.*cpu_small.*paper_large"):
+    with pytest.raises(ValueError, match="model=huge: must be one of debug, cpu_small.*paper_large"):
         get_size("huge")
