@@ -42,7 +42,7 @@ How well each algorithm flies here, what that took, and the command that runs it
 - **Use latent PPO**: `OMP_NUM_THREADS=1 ./dev python recipes/latent_ppo.py track=figure8 device=cpu`. With the true
   state in training two seeds have 99 and 100 % on Figure 8, 90 % after 56 and 47 minutes of one core, in all 84 and 79
   (float32; Circle took 33 in bfloat16, if `recipes/doctor.py` finds it). On Circle and Kidney it has 97 to 100 %.
-- **DreamerV3** learns in imagination. Its default races Circle and Figure 8, where success swings, one seed each. An
+- **DreamerV3** learns in imagination. Its default races Circle, and Figure 8 at times (0 to 100 %), one seed each. An
   earlier default raced Circle, two seeds, and Kidney, one seed; another was cut short.
 - **Without the true state** only latent PPO raced, and only Circle.
 - **PPO and SAC from images** were not trained long enough to judge. PPO from the true state races in 6 to 12 minutes.
