@@ -42,10 +42,10 @@ How well each algorithm flies here, what that took, and the command that runs it
 - **Use latent PPO**: `OMP_NUM_THREADS=1 ./dev python recipes/latent_ppo.py track=figure8 device=cpu`. With the true
   state in training two seeds have 99 and 100 % on Figure 8, 90 % after 56 and 47 minutes of one core, in all 84 and 79
   (float32; Circle took 33 in bfloat16, if `recipes/doctor.py` finds it). On Circle and Kidney it has 97 to 100 %.
-- **DreamerV3** learns in imagination. Its default races Circle, and Figure 8 at times (0 to 100 %), one seed each. An
+- **DreamerV3** learns in imagination. Its default races Circle, and Figure 8 with swings, one seed each. An
   earlier default raced Circle, two seeds, and Kidney, one seed; another was cut short.
 - **Without the true state** only latent PPO raced, and only Circle.
-- **PPO and SAC from images** were not trained long enough to judge. PPO from the true state races in 6 to 12 minutes.
+- **PPO and SAC from images** were not trained long enough to judge. PPO from the true state laps after 3 to 11 minutes.
 """
 SURE = """## How sure, and what is not shown
 
@@ -83,7 +83,7 @@ lap time           best 3.92 s, mean 4.02 s (300 laps)
 | success | share of flights that finish three laps, each from another randomised start, by the deterministic policy |
 | sampled | success of the stochastic policy, whose actions are samples from its distribution |
 | lap | mean over all complete laps, the first from rest, also of flights that crash later |
-| minutes | of one core, if no GPU is named. CPU and bfloat16 (DreamerV3) change them 2.5-fold: compare env_steps |
+| minutes | of one core, if no GPU is named. CPU and bfloat16 change them up to 2.5-fold: compare env_steps |
 | `schedule.NAME` | moves setting NAME as more gates are passed ([clock `known`](recipes.md#options)) |
 """
 
