@@ -40,8 +40,8 @@ HEAD = """# Results
 How well each algorithm flies here, what that took, and the command that runs it again. In short:
 
 - **Use latent PPO**: `OMP_NUM_THREADS=1 ./dev python recipes/latent_ppo.py track=figure8 device=cpu`. With the true
-  state in training two seeds have 99 and 100 % on Figure 8, 90 % after 56 and 47 minutes of one core, in all 84 and 79
-  (float32; Circle took 33 in bfloat16, if `recipes/doctor.py` finds it). On Circle and Kidney it has 97 to 100 %.
+  state in training two seeds have 99 and 100 % on Figure 8: 90 % after 56 and 47 minutes of one core, in all 84 and 79.
+  That is float32; Circle took 33 in bfloat16, if `recipes/doctor.py` finds it. Circle and Kidney have 97 to 100 %.
 - **DreamerV3** learns in imagination. Its default races Circle, and Figure 8 with swings, one seed each. An
   earlier default raced Circle, two seeds, and Kidney, one seed; another was cut short.
 - **Without the true state** only latent PPO raced, and only Circle.
@@ -232,7 +232,7 @@ def entry_text(entry: Entry, results: Path) -> str:
 
 def picture_text(path: str, caption: str) -> str:
     """Draw a picture, with its caption below it and the first clause of that as alternative text."""
-    return f"![{re.split('[,:;.] ', caption)[0]}](../{path})\n" + (f"*{caption}*\n" if caption else "")
+    return f"![{re.split('[:;.] ', caption)[0]}](../{path})\n" + (f"*{caption}*\n" if caption else "")
 
 
 def brief_text(entries: list[Entry], results: Path) -> list[str]:

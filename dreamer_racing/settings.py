@@ -185,14 +185,19 @@ def suggestion(word: object, known: Collection[str]) -> str:
     return f" (did you mean {close[0]}?)" if close else ""
 
 
+def wrong_choice(name: str, value: object, known: Collection[str]) -> str:
+    """Return the message that a setting's value is none of the known ones, with one that may have been meant."""
+    return f"{name}={value}: must be one of {', '.join(known)}{suggestion(value, known)}."
+
+
 def check_choice(name: str, value: object, known: Collection[str]) -> None:
     """Refuse a value that is not one of the known ones.
 
     Raises:
-        ValueError: The message has the setting's name, the known values, and one that may have been meant.
+        ValueError: The message is `wrong_choice`.
     """
     if value not in known:
-        raise ValueError(f"{name}={value}: must be one of {', '.join(known)}{suggestion(value, known)}.")
+        raise ValueError(wrong_choice(name, value, known))
 
 
 def import_own(name: str, asked: str) -> Any:

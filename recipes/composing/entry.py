@@ -21,9 +21,9 @@ from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import MissingMandatoryValue, OmegaConfBaseException
 
 from composing.messages import INTERRUPTED, is_follower_rank, say_error
-from composing.options import CONFIG_DIR, FLAGS, no_such_choice, no_such_setting
+from composing.options import CONFIG_DIR, FLAGS, no_such_setting
 from dreamer_racing.envs.simulator.opengl import RendererUnavailableError
-from dreamer_racing.settings import check_settings
+from dreamer_racing.settings import check_settings, wrong_choice
 
 
 @contextmanager
@@ -223,7 +223,7 @@ def in_plain_words(error: HydraException, recipe_name: str, overrides: Sequence[
         return no_such_setting(match[1], recipe_name)
     if match := re.search(r"Could not find '(.+)/(.+?)'\n\nAvailable options in '.+?':\n((?:\t.+\n)+)", text):
         group, choice, choices = match[1], match[2], [word for word in match[3].split() if word != "schema"]
-        return no_such_choice(group, choice, choices)
+        return wrong_choice(group, choice, choices)
     if match := re.search(r"Error merging override (.+)", text):
         wanted = str(cause).partition("\n")[0] if isinstance(cause, OmegaConfBaseException) else "it does not fit"
         for words, plain in PLAIN.items():

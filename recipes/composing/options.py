@@ -112,11 +112,6 @@ def no_such_setting(name: str, recipe: str) -> str:
     return f"{name}: there is no such setting of recipes/{recipe}.py{meant}. docs/options.md has them all."
 
 
-def no_such_choice(group: str, choice: str, choices: Sequence[str]) -> str:
-    """Return a message that a group has no such choice, with those that it has."""
-    return f"{group}={choice}: must be one of {', '.join(choices)}{settings.suggestion(choice, choices)}."
-
-
 def check_arguments(recipe: str, arguments: Sequence[str]) -> None:
     """Refuse unknown settings, unknown choices of a group, and settings written as flags."""
     for argument in arguments:
@@ -139,7 +134,7 @@ def check_arguments(recipe: str, arguments: Sequence[str]) -> None:
             quoted = settings.shortened(value)
             raise ValueError(f"{name}={quoted}: must be the name of one of the group's configurations.")
         if name in found and re.fullmatch(r"\w+", value) and value not in (*found[name], "null"):
-            raise ValueError(no_such_choice(name, value, found[name]))
+            raise ValueError(settings.wrong_choice(name, value, found[name]))
 
 
 WIDTH, COLUMN = 118, 42

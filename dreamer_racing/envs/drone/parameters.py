@@ -22,6 +22,7 @@ from dreamer_racing.envs.drone.variations import (
 from dreamer_racing.settings import (
     NOT_NEGATIVE,
     POSITIVE,
+    check_choice,
     check_numbers,
     check_settings,
     check_three,
@@ -176,9 +177,7 @@ def load_preset(preset: str | QuadrotorParameters) -> QuadrotorParameters:
         return preset
     if isinstance(preset, str) and preset.endswith(SUFFIXES):
         return _read_drone(Path(preset))
-    if not isinstance(preset, str) or preset not in PRESETS:
-        there = ", ".join(sorted(PRESETS))
-        raise ValueError(f"preset={preset}: must be one of {there}{suggestion(preset, PRESETS)}.")
+    check_choice("preset", preset, sorted(PRESETS))
     return PRESETS[preset]
 
 
