@@ -1,4 +1,4 @@
-"""Benchmark of an actor's learning signal: accuracy of imagined returns, noise of gradients, drift of the policy.
+"""Benchmark of an actor's learning signal: accuracy of imagined returns, noise and accuracy of gradients.
 
     python benchmarks/learning_signal.py runs/circle --json learning_signal.json
 
@@ -6,22 +6,18 @@
   0. From the latents at every eighth step it also imagines H steps. For real and imagined steps, `reward` is the sum
   until a crash, `crash` the share of crashes, `value_end` the critic's value after H steps (0 after a crash) and
   `return` the λ-return; `return_correlation` correlates the two returns over all starts. `value` is the critic's mean
-  on the first half of the flights, `monte_carlo` the mean discounted reward sum until the end of the episode or flight;
-  rewards cut off at the end of the flight would be discounted by at least γ to the power of K / 2.
+  on the first half of the flights, `monte_carlo` the mean discounted reward sum until the end of the episode or flight.
 * `gradient`: noise of the actor's gradient for each of the two objectives of imagined steps, from `starts` latents of
-  the run's replay, as many as in an update and eight times as many: `cosine` between gradients from independent draws,
-  `signal` power over noise power, and CPU `seconds` per gradient; `agreement` is the cosine between the mean gradients
-  of the two objectives.
-* `drift`: change of a fixed actor's policy by updates of the world model, for records with stored latents
-  (`replay.context=true`): divergence, nats, of the policy at a record's stored latents, which are from its last update
-  or its collection, from the policy at its current latents; mean and quantiles `of` windows of the newest records
-  (`replay.recent_share`) and of all records, most of which the model was not trained on recently.
+  the run's replay, as many as in an update and eight times as many: `cosine` of independent draws, `signal` over noise.
+* `collected`: whether imagination improves the real return: `cosine` between the gradient of REINFORCE on the steps of
+  the flight, with their λ-returns, and the gradient through the dynamics on H steps imagined from every eighth of their
+  latents: 1 is the same direction, below 0 imagination makes the policy worse. Both are without entropy. Noise is
+  corrected for, by four groups of worlds, whose mutual `cosine_collected` should be above 0.1: else raise N.
 
-H is the learner's horizon, or ``--horizon``. The trained weights are measured, not the averaged ones. If the checkpoint
-holds no replay (`best/`), use ``--only returns``.
+H is the learner's horizon, or ``--horizon``. The trained weights are measured, not the averaged ones. `gradient` needs
+the replay in the checkpoint.
 """
 
-import time
 from collections.abc import Iterator
 from typing import Any, NamedTuple, cast
 
@@ -37,13 +33,14 @@ from dreamer_racing.evaluation.held_out import correlation
 from dreamer_racing.experience.replay import StreamReplay
 from dreamer_racing.learners.update import WorldModelLearner
 from dreamer_racing.losses import OBJECTIVES, choose_starts, gradient_of_actions, imagine, lambda_return
+from dreamer_racing.losses.returns import rollout_return
 from dreamer_racing.modules.rssm import join_features
 
-PARTS = ("returns", "gradient", "drift")
+PARTS = ("returns", "gradient", "collected")
 OF_IMAGINED_STEPS = ("reinforce", "dynamics")
 EVERY = 8  # steps between two starts of imagination
 GRADIENTS, TIMES = 8, (1, 8)  # number of independent gradients, and multiples of an update's starts
-BATCHES, QUANTILES = 12, (0.1, 0.25, 0.5, 0.75, 0.9, 0.99)  # for the drift
+GROUPS = 4  # of worlds, for the noise of their gradients
 
 
 def main() -> None:
@@ -53,11 +50,14 @@ def main() -> None:
     parser.add_argument("--only", nargs="+", choices=PARTS, default=PARTS)
     parser.add_argument("--num-envs", type=int, default=64, help="N")
     parser.add_argument("--steps", type=int, default=320, help="K")
+    parser.add_argument("--start-on-line", type=float, help="share of flights from a racing line; default: the run's")
     parser.add_argument("--horizon", type=int, help="H; default: the learner's")
     arguments = parser.parse_args()
     records = []
     for path in arguments.checkpoints:
         trained = restore(path)
+        if arguments.start_on_line is not None:
+            trained.config.env.start_on_line = arguments.start_on_line
         if arguments.horizon:
             trained.learner.adjust(imagination_horizon=arguments.horizon)
         torch.manual_seed(0)
@@ -71,31 +71,23 @@ def main() -> None:
 def measure(trained: Trained, parts: tuple[str, ...], num_envs: int, steps: int) -> Iterator[dict[str, Any]]:
     """Yield the records of the chosen parts."""
     learner, model = trained.learner, trained.config.model
-    if "returns" in parts:
+    if "returns" in parts or "collected" in parts:
         env = make_env(trained.config, num_envs)
         longest = cast(DroneRacingEnv, env).worlds.race.episode_steps - 1
         if steps > longest:
             raise SystemExit(f"--steps {steps}: must be at most {longest}, so that no episode reaches its time limit.")
         flight = fly(learner, env, steps)
-        yield {"measured": "returns", "num_envs": num_envs, "steps": steps, **compare_returns(learner, flight)}
-    if "gradient" in parts or "drift" in parts:
-        replay = restore_replay(trained)
+        for part, compare in (("returns", compare_returns), ("collected", compare_gradients)):
+            if part in parts:
+                yield {"measured": part, "num_envs": num_envs, "steps": steps, **compare(learner, flight)}
     if "gradient" in parts:
+        replay = restore_replay(trained)
         starts = model.imagination_starts or model.batch_size * model.batch_length
         for times in TIMES:
             drawn = [draw_starts(learner, replay, starts * times) for _ in range(GRADIENTS)]
-            means: list[Tensor] = []
             for objective in OF_IMAGINED_STEPS:
-                began = time.process_time()
                 gradients = torch.stack([gradient(learner, some, objective) for some in drawn])
-                seconds = (time.process_time() - began) / GRADIENTS
-                means.append(gradients.mean(0))
-                row = {"measured": "gradient", "objective": objective, "starts": starts * times, "seconds": seconds}
-                yield row | noise_of(gradients)
-            agreement = F.cosine_similarity(means[0], means[1], dim=0).item()
-            yield {"measured": "agreement", "starts": starts * times, "cosine": agreement}
-    if "drift" in parts and trained.config.replay.context:
-        yield from drift(learner, replay)
+                yield {"measured": "gradient", "objective": objective, "starts": starts * times, **noise_of(gradients)}
 
 
 class Rollout(NamedTuple):
@@ -170,9 +162,8 @@ def draw_starts(learner: WorldModelLearner, replay: StreamReplay, number: int) -
     parts: list[TensorDict] = []
     while sum(map(len, parts)) < number:
         batch = replay.sample()
-        _, latents = learner.world_model_loss(batch)
         number_of_each = learner.config.imagination_starts
-        belief, state = latents
+        belief, state = learner.world_model_loss(batch)[1]
         starts = choose_starts(belief, state, batch["terminated"], batch["previous_action"], number_of_each)
         parts.append(TensorDict(starts._asdict(), [len(starts.belief)]))
     return cast(TensorDict, torch.cat(cast(Any, parts)))[:number]
@@ -202,23 +193,34 @@ def noise_of(rows: Tensor) -> dict[str, float]:
     return {"cosine": cosine.item(), "signal": (signal / noise).item()}
 
 
-@torch.no_grad()
-def drift(learner: WorldModelLearner, replay: StreamReplay) -> Iterator[dict[str, Any]]:
-    """Yield a record of the policy's drift for windows of the newest records, and one for windows of all records."""
-    moved, recent = [], []
-    for _ in range(BATCHES):
-        batch = replay.sample()
-        _, seen = learner.world_model_loss(batch)
-        before, after, same = learner.stored_and_current_features(seen, batch)
-        divergence, same = learner.agent.actor(before).divergence(learner.agent.actor(after)), same.squeeze(-1)
-        moved.append(divergence.squeeze(-1)[same])
-        recent.append(batch["recent"].reshape(len(same), -1)[:, :1].expand_as(same)[same])
-    of_all, newest = torch.cat(moved), torch.cat(recent)
-    for name, values in (("newest", of_all[newest]), ("all", of_all[~newest])):
-        if len(values):
-            quantiles = zip(QUANTILES, values.quantile(torch.tensor(QUANTILES)).tolist(), strict=True)
-            found = {f"q{100 * share:.0f}": value for share, value in quantiles}
-            yield {"measured": "drift", "of": name, "records": len(values), "mean": values.mean().item(), **found}
+def compare_gradients(learner: WorldModelLearner, flight: TensorDict) -> dict[str, float]:
+    """Return the numbers of `collected` (see the module's docstring) of a flight ``[K, N]``."""
+    flight["terminated"] = torch.zeros_like(flight["done"])  # that a step ends the episode is seen after it
+    parts = flight.tensor_split(GROUPS, 1)
+    real = torch.stack([collected_gradient(learner, part) for part in parts])
+    imagined = torch.stack([gradient(learner, part[::EVERY].flatten(), "dynamics") for part in parts])
+    return {"cosine": common_cosine(real, imagined), "cosine_collected": noise_of(real)["cosine"]}
+
+
+def collected_gradient(learner: WorldModelLearner, flight: TensorDict) -> Tensor:
+    """Return the actor's gradient ``(P,)`` of REINFORCE on the steps of a flight ``[K, N]``, without entropy."""
+    actor, features = learner.agent.actor, join_features(flight["belief"], flight["state"])
+    with torch.no_grad():
+        value, done = learner.agent.critic.value(features), flight["done"]
+        returns = rollout_return(flight["reward"], value, done, done, learner.discount, learner.loss_config.lambda_)
+    score, advantage = actor(features).log_prob_clipped(flight["action"]), returns - value
+    gradients = torch.autograd.grad(-(score * (advantage - advantage.mean())).mean(), list(actor.parameters()))
+    return torch.cat([part.flatten() for part in gradients])
+
+
+def common_cosine(rows: Tensor, others: Tensor) -> float:
+    """Return the cosine between the means of two sets of independent gradients ``(G, P)``, corrected for noise.
+
+    Only products of different groups are used, since those of the same group share noise. NaN if a set is mostly noise.
+    """
+    products = (a @ b.T for a, b in ((rows, others), (rows, rows), (others, others)))
+    common, own, their = (product.sum() - product.diagonal().sum() for product in products)
+    return (common / (own * their).sqrt()).item()
 
 
 if __name__ == "__main__":

@@ -75,15 +75,15 @@ def restore_replay(trained: Trained, config: WorldModelRunConfig | None = None) 
 def fly(learner: WorldModelLearner, env: Environment, steps: int) -> TensorDict:
     """Fly the stochastic policy for K steps in N worlds; return the records, batch ``[K, N]``.
 
-    ``belief`` and ``state`` are the latents with which the policy acted, ``reward`` and ``done`` the results of the
-    step, and ``vector`` the simulator's state before it, if the worlds provide it.
+    ``belief`` and ``state`` are the latents with which the policy acted, ``action`` its clipped action, ``reward`` and
+    ``done`` the results of the step, and ``vector`` the simulator's state before it, if the worlds provide it.
     """
     policy, records = learner.policy(), []
     remembering = with_memory(env, policy.make_primer())
     step = remembering.reset()
     for _ in range(steps):
         step, following = remembering.step_and_maybe_reset(policy(step))
-        record = step["next"].select("belief", "state", "reward", "done")
+        record = step["next"].select("belief", "state", "reward", "done").set("action", step["action"])
         if PRIVILEGED in step.keys(True):
             record["vector"] = step[PRIVILEGED]
         records.append(record.clone())

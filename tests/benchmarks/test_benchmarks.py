@@ -122,3 +122,25 @@ def test_gradients_of_both_objectives_are_that_of_what_is_paid(objective: str) -
     still = torch.zeros(4000, 1)
     starts = TensorDict({"belief": still, "state": still[:, :0], "terminated": still}, [4000])
     assert learning_signal.gradient(learner, starts, objective).item() == pytest.approx(-1.0, abs=0.1)
+
+
+def test_a_common_cosine_is_that_of_the_means_without_their_noise() -> None:
+    torch.manual_seed(0)
+    one, other = torch.nn.functional.normalize(torch.randn(2, 1000), dim=1)
+    noisy = [8 * torch.randn(64, 1000) / 1000**0.5 for _ in range(2)]
+    assert learning_signal.common_cosine(noisy[0] + 4 * one, noisy[1] - 4 * one) == pytest.approx(-1.0, abs=0.1)
+    assert learning_signal.common_cosine(noisy[0] + 4 * one, noisy[1] + 4 * other) == pytest.approx(0.0, abs=0.1)
+
+
+def test_the_gradient_of_collected_steps_is_that_of_what_is_paid() -> None:
+    """Each action is paid at once, so the mean reward rises by 1 with the mean action."""
+    torch.manual_seed(0)
+    actor = LineActor()
+    agent = SimpleNamespace(actor=actor, critic=SimpleNamespace(value=torch.zeros_like))
+    learner = SimpleNamespace(agent=agent, discount=torch.tensor(0.9), loss_config=SimpleNamespace(lambda_=0.0))
+    action = (0.3 * torch.randn(40, 500, 1)).clamp(-1.0, 1.0)
+    at = torch.zeros(40, 500, 1)
+    flight = TensorDict(
+        {"belief": at, "state": at[..., :0], "action": action, "reward": action, "done": at > 0}, [40, 500]
+    )
+    assert learning_signal.collected_gradient(learner, flight).item() == pytest.approx(-1.0, abs=0.05)
