@@ -40,10 +40,10 @@ HEAD = """# Results
 How well each algorithm flies here, what that took, and the command that runs it again. In short:
 
 - **Use latent PPO**: `OMP_NUM_THREADS=1 ./dev python recipes/latent_ppo.py track=figure8 device=cpu`. With the true
-  state in training two seeds have 99 and 100 % on Figure 8: 90 % after 56 and 47 minutes of one core, in all 84 and 79.
-  That is float32; Circle took 33 in bfloat16, if `recipes/doctor.py` finds it. Circle and Kidney have 97 to 100 %.
-- **DreamerV3** learns in imagination. Its default races Circle, and Figure 8 with swings, one seed each. An
-  earlier default raced Circle, two seeds, and Kidney, one seed; another was cut short.
+  state in training two seeds have 99 and 100 % on Figure 8, after 84 and 79 minutes of one core, and 97 to 100 % on
+  Circle and Kidney. Circle took 33 minutes with bfloat16, which `recipes/doctor.py` finds.
+- **DreamerV3** learns in imagination. Its default races Circle, one seed; it is new. Earlier defaults raced Circle,
+  three seeds, and Kidney and Figure 8, one seed each. A second one of Kidney was cut short.
 - **Without the true state** only latent PPO raced, and only Circle.
 - **PPO and SAC from images** were not trained long enough to judge. PPO from the true state laps after 3 to 11 minutes.
 """
@@ -53,11 +53,9 @@ SURE = """## How sure, and what is not shown
   *this* trained agent. The starts of the 100 flights were never used in training.
 - **Seeds.** One or two runs do not say how the next one goes: those that had 90 % had it up to 150,000 env_steps
   apart, and one was far behind when cut short. Another processor rounds differently, which acts like another seed.
-- **First 90 %** is the first evaluation with it, of 60 flights, every 100,000 env_steps (Circle by DreamerV3 and images
-  alone: 50,000). So 0.4 means between 0.3 and 0.4.
 - **Selection.** Settings were chosen on these tracks, DreamerV3's on Circle, seeds 0 and 1, and Figure 8, seed 0.
-- **Not shown:** a real drone; a second seed of DreamerV3's default; Kidney by it; an agent of images alone on any track
-  but Circle; today's settings on a GPU; 20 million env_steps. [More](what_we_know.md#what-is-not-known).
+- **Not shown:** a real drone; a complete run of DreamerV3's default; an agent of images alone on any track but Circle;
+  today's settings on a GPU; 20 million env_steps. [More](what_we_know.md#what-is-not-known).
 """
 CHECK = """## Check an included agent
 
@@ -68,9 +66,8 @@ The agent [kidney](agents.md) had 100 %, sampled 98 %, on another processor. Fly
 ```
 
 You should see this, then a block of the sampled policy (98 %); a few flights differ between processors. Files go to
-`runs/agent_kidney/evaluation`. All runs on this page were evaluated like this at their end (`checkpoint=runs/RUN`),
-unless a table says otherwise. Commands on this page use today's defaults; the original ones are behind *Commands,
-commits, machine*. In those before commit 2c16a57 `recipes/dreamer_v3.py` is latent PPO.
+`runs/agent_kidney/evaluation`. All runs on this page were evaluated like this (`checkpoint=runs/RUN`), unless a table
+says otherwise. Commands use today's defaults; the original ones are behind *Commands, commits, machine*.
 
 ```text
 deterministic policy, 100 episodes
@@ -80,11 +77,10 @@ lap time           best 3.92 s, mean 4.02 s (300 laps)
 
 | word | meaning on this page |
 |---|---|
-| success | share of flights that finish three laps, each from another randomised start, by the deterministic policy |
-| sampled | success of the stochastic policy, whose actions are samples from its distribution |
+| success; sampled | share of flights that finish three laps, from randomised starts: deterministic; stochastic policy |
+| first 90 % | first evaluation in which 90 % of 60 flights succeed; one is flown every 50,000 or 100,000 env_steps |
 | lap | mean over all complete laps, the first from rest, also of flights that crash later |
 | minutes | of one core, if no GPU is named. CPU and bfloat16 change them up to 2.5-fold: compare env_steps |
-| `schedule.NAME` | moves setting NAME as more gates are passed ([clock `known`](recipes.md#options)) |
 """
 
 
