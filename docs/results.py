@@ -12,8 +12,8 @@ A folder of results is described by its `provenance.json`, an entry or a list of
 `title` and `files`, relative to the folder, are required. What is null or missing is read from the records of its JSON
 files where they have it (`machine`, `commit`), and otherwise the page says that it was not recorded. `command` is what
 was run at `commit`, which the page links; `today` starts the same now, and is printed. `fills` names cells of
-results/planned.json, the table of planned runs (with a `picture` below it), and may say what a cell shows instead of
-the title; a cell that nothing fills says so. With `"brief": true` an entry is a row of the last table: its `result`, no
+results/planned.json, the tables of planned runs (a table without `rows` is its text; a `picture` is shown below it), and
+may say what a cell shows instead of the title; a cell that nothing fills says so. With `"brief": true` an entry is a row of the last table: its `result`, no
 commands, no pictures; without a `result` another page shows it.
 """
 
@@ -40,34 +40,23 @@ HEAD = """# Results
 How well each algorithm flies here, what that took, and the command that runs it again. In short:
 
 - **Use latent PPO**: `OMP_NUM_THREADS=1 ./dev python recipes/latent_ppo.py track=figure8 device=cpu`. With the true
-  state in training two seeds have 99 and 100 % on Figure 8, after 84 and 79 minutes of one core, and 97 to 100 % on
-  Circle and Kidney. Circle took 33 minutes with bfloat16, which `recipes/doctor.py` finds.
-- **DreamerV3** learns in imagination. Its default races Circle, one seed; it is new. Earlier defaults raced Circle,
-  three seeds, and Kidney and Figure 8, one seed each. A second one of Kidney was cut short.
-- **Without the true state** only latent PPO raced, and only Circle.
-- **PPO and SAC from images** were not trained long enough to judge. PPO from the true state laps after 3 to 11 minutes.
-"""
-SURE = """## How sure, and what is not shown
+  state in training it races all three tracks: 97 to 100 %, two seeds each, after 79 to 84 minutes of one core. Circle
+  took 33 on a CPU with bfloat16 (`recipes/doctor.py` says whether yours has it).
+- **DreamerV3** learns in imagination. Today's default races Circle (one seed); on Kidney and Figure 8 it was cut short.
+  Earlier defaults raced Circle (three seeds), Kidney (one of two; the other was cut short) and Figure 8 (one, unstable).
+- **Without the true state** latent PPO races Circle, the only track tried. DreamerV3, PPO and SAC were cut short.
+- **PPO from the true state** laps after 3 to 11 minutes.
 
-- **Flights.** Of 100, 100 % means 96 to 100 %, 97 % means 92 to 99 %, 93 % means 86 to 97 % (95 % intervals), for
-  *this* trained agent. The starts of the 100 flights were never used in training.
-- **Seeds.** One or two runs do not say how the next one goes: those that had 90 % had it up to 150,000 env_steps
-  apart, and one was far behind when cut short. Another processor rounds differently, which acts like another seed.
-- **Selection.** Settings were chosen on these tracks, DreamerV3's on Circle, seeds 0 and 1, and Figure 8, seed 0.
-- **Not shown:** a real drone; a complete run of DreamerV3's default; an agent of images alone on any track but Circle;
-  today's settings on a GPU; 20 million env_steps. [More](what_we_know.md#what-is-not-known).
-"""
-CHECK = """## Check an included agent
+## How success is measured
 
-The agent [kidney](agents.md) had 100 %, sampled 98 %, on another processor. Fly it 2 × 100 times (40 s):
+All runs on this page were evaluated at their end by this command, here for an included agent (40 s):
 
 ```bash
 ./dev python recipes/evaluate.py checkpoint=kidney episodes=100 num_envs=100 start_noise=1 seed=7
 ```
 
-You should see this, then a block of the sampled policy (98 %); a few flights differ between processors. Files go to
-`runs/agent_kidney/evaluation`. All runs on this page were evaluated like this (`checkpoint=runs/RUN`), unless a table
-says otherwise. Commands use today's defaults; the original ones are behind *Commands, commits, machine*.
+You should see this, then a block of the sampled policy (98 %); a few flights differ between processors. For a run of
+your own give `checkpoint=runs/RUN`.
 
 ```text
 deterministic policy, 100 episodes
@@ -77,10 +66,25 @@ lap time           best 3.92 s, mean 4.02 s (300 laps)
 
 | word | meaning on this page |
 |---|---|
-| success; sampled | share of flights that finish three laps, from randomised starts: deterministic; stochastic policy |
-| first 90 % | first evaluation in which 90 % of 60 flights succeed; one is flown every 50,000 or 100,000 env_steps |
-| lap | mean over all complete laps, the first from rest, also of flights that crash later |
+| success | share of 100 flights that finish three laps, each from another randomised start, by the deterministic policy |
+| sampled | the same, with actions drawn from the policy's distribution |
+| gates | passed per flight, of 12 on Circle, of 18 on Kidney and Figure 8 (three laps) |
+| env_steps | control steps, summed over all simulated drones |
+| to 90 % | until an evaluation during training had 90 % of 60 flights; one is flown every 50,000 or 100,000 env_steps |
+| lap | mean of all completed laps, the first, from rest, too, and those of flights that crash later |
 | minutes | of one core, if no GPU is named. CPU and bfloat16 change them up to 2.5-fold: compare env_steps |
+| true state | 21 numbers of the simulator, such as velocity. No agent from images sees them in flight |
+"""
+SURE = """## How sure, and what is not shown
+
+- **Flights.** Of 100, 100 % means 96 to 100 %, 97 % means 92 to 99 %, 93 % means 86 to 97 % (95 % intervals), for
+  *this* trained agent.
+- **Seeds.** One to three runs do not say how the next one goes; one (Kidney, DreamerV3) was far behind when cut short.
+- **Selection.** Settings were chosen on these tracks, DreamerV3's on three of these runs (Circle 0 and 1, Figure 8 0).
+- **Not shown:** a real drone; a complete run of DreamerV3's default; an agent of images alone on any track but Circle;
+  today's settings on a GPU; the paper's 20 million env_steps. The gate coordinates are this project's own, so the
+  paper's numbers cannot be compared. [More](what_we_know.md#what-is-not-known).
+- Commands below use today's defaults. Each section links the original ones (*Commands, commits, machine*).
 """
 
 
@@ -138,7 +142,7 @@ def make_page(results: Path) -> str:
     entries.sort(key=lambda entry: min(map(known.index, entry.fills), default=len(known)))
     long = [entry_text(entry, results) for entry in entries if not entry.brief]
     brief = [entry for entry in entries if entry.brief and entry.result]  # the others are shown on pages of their own
-    parts = [HEAD, *tables, SURE, CHECK, *long, *brief_text(brief, results)]
+    parts = [HEAD, *tables, SURE, *long, *brief_text(brief, results)]
     return "\n".join(parts).rstrip("\n") + "\n"
 
 
@@ -196,14 +200,15 @@ def recorded(folder: Path, files: dict[str, str], name: str) -> str | None:
 
 def cells_of(table: dict[str, Any]) -> list[str]:
     """Name the cells of a planned table: row/column."""
-    return [f"{row}/{column}" for row in table["rows"] for column in table["columns"]]
+    return [f"{row}/{column}" for row in table.get("rows", ()) for column in table["columns"]]
 
 
 def table_text(table: dict[str, Any], entries: list[Entry]) -> str:
     """Draw a planned table; its cells link to what fills them."""
-    lines = [f"## {table['title']}\n", f"{wrapped(table['text'])}\n", f"| | {' | '.join(table['columns'].values())} |"]
-    lines.append("|---" * (len(table["columns"]) + 1) + "|")
-    for row, title in table["rows"].items():
+    lines = [f"## {table['title']}\n", wrapped(table["text"])]
+    if "rows" in table:
+        lines += [f"\n| | {' | '.join(table['columns'].values())} |", "|---" * (len(table["columns"]) + 1) + "|"]
+    for row, title in table.get("rows", {}).items():
         names = [f"{row}/{column}" for column in table["columns"]]
         links = ([f"[{e.fills[name]}](#{e.anchor})" for e in entries if name in e.fills] for name in names)
         cells = ["<br>".join(found) or NOT_RUN for found in links]
