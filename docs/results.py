@@ -12,9 +12,9 @@ A folder of results is described by its `provenance.json`, an entry or a list of
 `title` and `files`, relative to the folder, are required. What is null or missing is read from the records of its JSON
 files where they have it (`machine`, `commit`), and otherwise the page says that it was not recorded. `command` is what
 was run at `commit`, which the page links; `today` starts the same now, and is printed. `fills` names cells of
-results/planned.json, the tables of planned runs (a table without `rows` is its text; a `picture` is shown below it), and
-may say what a cell shows instead of the title; a cell that nothing fills says so. With `"brief": true` an entry is a row of the last table: its `result`, no
-commands, no pictures; without a `result` another page shows it.
+results/planned.json, the tables of planned runs (a table without `rows` is its text; a `picture` is shown below it),
+and may say what a cell shows instead of the title; a cell that nothing fills says so. With `"brief": true` an entry is
+a row of the last table: its `result`, no commands, no pictures; without a `result` another page shows it.
 """
 
 import argparse
@@ -43,7 +43,7 @@ How well each algorithm flies here, what that took, and the command that runs it
   state in training it races all three tracks: 97 to 100 %, two seeds each, after 79 to 84 minutes of one core. Circle
   took 33 on a CPU with bfloat16 (`recipes/doctor.py` says whether yours has it).
 - **DreamerV3** learns in imagination. Today's default races Circle (one seed); on Kidney and Figure 8 it was cut short.
-  Earlier defaults raced Circle (three seeds), Kidney (one of two; the other was cut short) and Figure 8 (one, unstable).
+  Earlier ones raced Circle (three seeds), Kidney (one of two; the other was cut short) and Figure 8 (one, unstable).
 - **Without the true state** latent PPO races Circle, the only track tried. DreamerV3, PPO and SAC were cut short.
 - **PPO from the true state** laps after 3 to 11 minutes.
 
@@ -66,7 +66,7 @@ lap time           best 3.92 s, mean 4.02 s (300 laps)
 
 | word | meaning on this page |
 |---|---|
-| success | share of 100 flights that finish three laps, each from another randomised start, by the deterministic policy |
+| success | share of 100 flights, each from a new randomised start, that finish three laps by the deterministic policy |
 | sampled | the same, with actions drawn from the policy's distribution |
 | gates | passed per flight, of 12 on Circle, of 18 on Kidney and Figure 8 (three laps) |
 | env_steps | control steps, summed over all simulated drones |
