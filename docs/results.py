@@ -41,7 +41,7 @@ How well each algorithm flies here, what that took, and the command that runs it
 
 - **Use latent PPO**: `OMP_NUM_THREADS=1 ./dev python recipes/latent_ppo.py track=figure8 device=cpu`. With the true
   state in training it races all three tracks: 97 to 100 %, two seeds each, after 79 to 84 minutes of one core. Circle
-  took 33 on a CPU with bfloat16 (`recipes/doctor.py` says whether yours has it).
+  took 33 on an AMD EPYC in bfloat16 (`recipes/doctor.py` says whether your CPU has it).
 - **DreamerV3** learns in imagination. Today's default races Circle (one seed); on Kidney and Figure 8 it was cut short.
   Earlier ones raced Circle (three seeds), Kidney (one of two; the other was cut short) and Figure 8 (one, unstable).
 - **Without the true state** latent PPO races Circle, the only track tried. DreamerV3, PPO and SAC were cut short.
@@ -49,7 +49,7 @@ How well each algorithm flies here, what that took, and the command that runs it
 
 ## How success is measured
 
-All runs on this page were evaluated at their end by this command, here for an included agent (40 s):
+Runs with a sampled success were evaluated at their end by this command, here for an included agent (40 s):
 
 ```bash
 ./dev python recipes/evaluate.py checkpoint=kidney episodes=100 num_envs=100 start_noise=1 seed=7
@@ -70,7 +70,7 @@ lap time           best 3.92 s, mean 4.02 s (300 laps)
 | sampled | the same, with actions drawn from the policy's distribution |
 | gates | passed per flight, of 12 on Circle, of 18 on Kidney and Figure 8 (three laps) |
 | env_steps | control steps, summed over all simulated drones |
-| to 90 % | until an evaluation during training had 90 % of 60 flights; one is flown every 50,000 or 100,000 env_steps |
+| to 90 % | until an evaluation during training had 90 % of 60 flights; they are 25,000 to 500,000 env_steps apart |
 | lap | mean of all completed laps, the first, from rest, too, and those of flights that crash later |
 | minutes | of one core, if no GPU is named. CPU and bfloat16 change them up to 2.5-fold: compare env_steps |
 | true state | 21 numbers of the simulator, such as velocity. No agent from images sees them in flight |
@@ -79,8 +79,8 @@ SURE = """## How sure, and what is not shown
 
 - **Flights.** Of 100, 100 % means 96 to 100 %, 97 % means 92 to 99 %, 93 % means 86 to 97 % (95 % intervals), for
   *this* trained agent.
-- **Seeds.** One to three runs do not say how the next one goes; one (Kidney, DreamerV3) was far behind when cut short.
-- **Selection.** Settings were chosen on these tracks, DreamerV3's on three of these runs (Circle 0 and 1, Figure 8 0).
+- **Seeds.** One to three runs do not say how the next one goes. Kidney 1 of default B was far behind when cut short.
+- **Selection.** Settings were chosen on these tracks, DreamerV3's on Circle 0 and 1 of B and Figure 8 0 of A.
 - **Not shown:** a real drone; a complete run of DreamerV3's default; an agent of images alone on any track but Circle;
   today's settings on a GPU; the paper's 20 million env_steps. The gate coordinates are this project's own, so the
   paper's numbers cannot be compared. [More](what_we_know.md#what-is-not-known).
