@@ -40,12 +40,12 @@ HEAD = """# Results
 How well each algorithm flies here, what that took, and the command that runs it again. In short:
 
 - **Use latent PPO**: `OMP_NUM_THREADS=1 ./dev python recipes/latent_ppo.py track=figure8 device=cpu`. With the true
-  state in training it races all three tracks: 97 to 100 %, two seeds each, after 79 to 84 minutes of one core. Circle
-  took 33 on an AMD EPYC in bfloat16 (`recipes/doctor.py` says whether your CPU has it).
+  state in training it races all three tracks: 97 to 100 %, two seeds each, trained for 79 to 84 minutes on one core
+  (one run of Circle for 33, on an AMD EPYC in bfloat16). Split-S: 92 %, one seed.
 - **DreamerV3** learns in imagination. Today's default races Circle (one seed); on Kidney and Figure 8 it was cut short.
   Earlier ones raced Circle (three seeds), Kidney (one of two; the other was cut short) and Figure 8 (one, unstable).
-- **Without the true state** latent PPO races Circle, the only track tried. DreamerV3, PPO and SAC were cut short.
-- **PPO from the true state** laps after 3 to 11 minutes.
+- **Without the true state** latent PPO races Circle, the only track tried. Others: cut short, under two gates.
+- **PPO from the true state** flies three clean laps after 3 to 11 minutes.
 
 ## How success is measured
 
@@ -55,8 +55,7 @@ Runs with a sampled success were evaluated at their end by this command, here fo
 ./dev python recipes/evaluate.py checkpoint=kidney episodes=100 num_envs=100 start_noise=1 seed=7
 ```
 
-You should see this, then a block of the sampled policy (98 %); a few flights differ between processors. For a run of
-your own give `checkpoint=runs/RUN`.
+You should see this, then a block of the sampled policy (98 %), up to a few flights. For yours: `checkpoint=runs/RUN`.
 
 ```text
 deterministic policy, 100 episodes
@@ -80,11 +79,11 @@ SURE = """## How sure, and what is not shown
 - **Flights.** Of 100, 100 % means 96 to 100 %, 97 % means 92 to 99 %, 93 % means 86 to 97 % (95 % intervals), for
   *this* trained agent.
 - **Seeds.** One to three runs do not say how the next one goes. Kidney 1 of default B was far behind when cut short.
-- **Selection.** Settings were chosen on these tracks, DreamerV3's on Circle 0 and 1 of B and Figure 8 0 of A.
+- **Selection.** Settings were chosen on these tracks, DreamerV3's on B's Circle and A's Figure 8, which flatters.
 - **Not shown:** a real drone; a complete run of DreamerV3's default; an agent of images alone on any track but Circle;
   today's settings on a GPU; the paper's 20 million env_steps. The gate coordinates are this project's own, so the
   paper's numbers cannot be compared. [More](what_we_know.md#what-is-not-known).
-- Commands below use today's defaults. Each section links the original ones (*Commands, commits, machine*).
+- **Commands** below use today's defaults; for A and B take the originals (*Commands, commits, machine*).
 """
 
 
