@@ -44,12 +44,12 @@ How well each algorithm flies here, what that took, and the command that runs it
   (one run of Circle for 33, on an AMD EPYC in bfloat16). Split-S: 92 %, one seed.
 - **DreamerV3** learns in imagination. Today's default races Circle (one seed); on Kidney and Figure 8 it was cut short.
   Earlier ones raced Circle (three seeds), Kidney (one of two; the other was cut short) and Figure 8 (one, unstable).
-- **Without the true state** latent PPO races Circle, the only track tried. Others: cut short, under two gates.
+- **Without the true state** latent PPO races Circle, the only track tried. Others: cut short, none near 90 %.
 - **PPO from the true state** flies three clean laps after 3 to 11 minutes.
 
 ## How success is measured
 
-Runs with a sampled success were evaluated at their end by this command, here for an included agent (40 s):
+Rows of tables with *sampled* come from this command at a run's end, here for an included agent (40 s):
 
 ```bash
 ./dev python recipes/evaluate.py checkpoint=kidney episodes=100 num_envs=100 start_noise=1 seed=7
@@ -71,13 +71,12 @@ lap time           best 3.92 s, mean 4.02 s (300 laps)
 | env_steps | control steps, summed over all simulated drones |
 | to 90 % | until an evaluation during training had 90 % of 60 flights; they are 25,000 to 500,000 env_steps apart |
 | lap | mean of all completed laps, the first, from rest, too, and those of flights that crash later |
-| minutes | of one core, if no GPU is named. CPU and bfloat16 change them up to 2.5-fold: compare env_steps |
+| minutes | of one core. CPU and bfloat16 (the recipe chooses) change them up to 2.5-fold: compare env_steps |
 | true state | 21 numbers of the simulator, such as velocity. No agent from images sees them in flight |
 """
 SURE = """## How sure, and what is not shown
 
-- **Flights.** Of 100, 100 % means 96 to 100 %, 97 % means 92 to 99 %, 93 % means 86 to 97 % (95 % intervals), for
-  *this* trained agent.
+- **Flights.** Of 100, 100 % means 96 to 100 %, 97 % 92 to 99 %, 93 % 86 to 97 % (95 % intervals), for *this* agent.
 - **Seeds.** One to three runs do not say how the next one goes. Kidney 1 of default B was far behind when cut short.
 - **Selection.** Settings were chosen on these tracks, DreamerV3's on B's Circle and A's Figure 8, which flatters.
 - **Not shown:** a real drone; a complete run of DreamerV3's default; an agent of images alone on any track but Circle;
