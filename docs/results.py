@@ -42,8 +42,8 @@ How well each algorithm flies here, what that took, and the command that runs it
 - **Use latent PPO**: `OMP_NUM_THREADS=1 ./dev python recipes/latent_ppo.py track=figure8 device=cpu`. With the true
   state in training it races all three tracks: 97 to 100 %, two seeds each, trained for 79 to 84 minutes on one core
   (one run of Circle for 33, on an AMD EPYC in bfloat16). Split-S: 92 %, one seed.
-- **DreamerV3** learns in imagination. Today's default races Circle (one seed); on Kidney and Figure 8 it was cut short.
-  Earlier ones raced Circle (three seeds), Kidney (one of two; the other was cut short) and Figure 8 (one, unstable).
+- **DreamerV3** learns in imagination. Today's default races Circle and Figure 8, where success still dips (one seed
+  each). Earlier ones raced Circle (three seeds), Figure 8 (one) and Kidney (one of two; the other was cut short).
 - **Without the true state** latent PPO races Circle, the only track tried. Others: cut short, none near 90 %.
 - **PPO from the true state** flies three clean laps after 3 to 11 minutes.
 
