@@ -62,8 +62,8 @@ def main() -> None:
             trained.learner.adjust(imagination_horizon=arguments.horizon)
         torch.manual_seed(0)
         for record in measure(trained, arguments.only, arguments.num_envs, arguments.steps):
-            where = trained.where | {"horizon": trained.learner.horizon}
-            records.append({"benchmark": "learning_signal", **where, **record})
+            own = {"horizon": trained.learner.horizon, "start_on_line": trained.config.env.start_on_line}
+            records.append({"benchmark": "learning_signal", **trained.where, **own, **record})
             print_table([{"name": name, "value": value} for name, value in records[-1].items()], ("name", "value"))
             write_json(records, arguments.json)
 
@@ -198,8 +198,8 @@ def compare_gradients(learner: WorldModelLearner, flight: TensorDict) -> dict[st
     flight["terminated"] = torch.zeros_like(flight["done"])  # that a step ends the episode is seen after it
     parts = flight.tensor_split(GROUPS, 1)
     real = torch.stack([collected_gradient(learner, part) for part in parts])
-    imagined = torch.stack([gradient(learner, part[::EVERY].flatten(), "dynamics") for part in parts])
-    return {"cosine": common_cosine(real, imagined), "cosine_collected": noise_of(real)["cosine"]}
+    model = torch.stack([gradient(learner, part[::EVERY].flatten(), "dynamics") for part in parts])
+    return {"cosine": common_cosine(real, model), "cosine_collected": noise_of(real)["cosine"]}
 
 
 def collected_gradient(learner: WorldModelLearner, flight: TensorDict) -> Tensor:
@@ -220,7 +220,7 @@ def common_cosine(rows: Tensor, others: Tensor) -> float:
     """
     products = (a @ b.T for a, b in ((rows, others), (rows, rows), (others, others)))
     common, own, their = (product.sum() - product.diagonal().sum() for product in products)
-    return (common / (own * their).sqrt()).item()
+    return (common / (own.sqrt() * their.sqrt())).item()
 
 
 if __name__ == "__main__":

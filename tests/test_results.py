@@ -95,6 +95,12 @@ def test_a_planned_table_may_have_a_picture_below_it(results, folder):
     )
 
 
+def test_a_planned_table_without_rows_is_its_text(results, folder):
+    planned = json.loads((folder / "planned.json").read_text())
+    (folder / "planned.json").write_text(json.dumps([*planned, {"title": "Each run", "text": "| a | b |\n|---|---|"}]))
+    assert "\n## Each run\n\n| a | b |\n|---|---|\n" in results.make_page(folder)
+
+
 def test_brief_entries_are_rows_of_the_last_table(results, folder):
     change(folder, brief=True, result="a figure", command="python x.py")
     page = results.make_page(folder)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -130,6 +131,8 @@ def test_a_common_cosine_is_that_of_the_means_without_their_noise() -> None:
     noisy = [8 * torch.randn(64, 1000) / 1000**0.5 for _ in range(2)]
     assert learning_signal.common_cosine(noisy[0] + 4 * one, noisy[1] - 4 * one) == pytest.approx(-1.0, abs=0.1)
     assert learning_signal.common_cosine(noisy[0] + 4 * one, noisy[1] + 4 * other) == pytest.approx(0.0, abs=0.1)
+    cancelling = torch.stack((one, -one))
+    assert math.isnan(learning_signal.common_cosine(cancelling, cancelling))  # mostly noise, both of them
 
 
 def test_the_gradient_of_collected_steps_is_that_of_what_is_paid() -> None:
