@@ -1,7 +1,7 @@
 """Latent overshooting, a user-defined target of the world model, see docs/losses.md, "A larger target".
 
     export PYTHONPATH=examples/losses
-    ./dev python recipes/dreamer_v3.py track=circle tuned=none loss.world_model=reconstruction+overshooting:Overshooting
+    ./dev python recipes/dreamer_v3.py track=circle loss.world_model=privileged+overshooting:Overshooting
 
 From each record it predicts three steps without observations, from the actions taken, and compares the prior with the
 posterior there. Columns: loss_overshooting, overshooting_kl.
