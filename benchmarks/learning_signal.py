@@ -198,8 +198,8 @@ def compare_gradients(learner: WorldModelLearner, flight: TensorDict) -> dict[st
     flight["terminated"] = torch.zeros_like(flight["done"])  # that a step ends the episode is seen after it
     parts = flight.tensor_split(GROUPS, 1)
     real = torch.stack([collected_gradient(learner, part) for part in parts])
-    model = torch.stack([gradient(learner, part[::EVERY].flatten(), "dynamics") for part in parts])
-    return {"cosine": common_cosine(real, model), "cosine_collected": noise_of(real)["cosine"]}
+    imagined = torch.stack([gradient(learner, part[::EVERY].flatten(), "dynamics") for part in parts])
+    return {"cosine": common_cosine(real, imagined), "cosine_collected": noise_of(real)["cosine"]}
 
 
 def collected_gradient(learner: WorldModelLearner, flight: TensorDict) -> Tensor:

@@ -265,15 +265,19 @@ def test_the_target_is_what_its_text_says(my_losses):
     assert all(parameter.grad is None for parameter in model.reward_head.parameters())
 
 
-@pytest.mark.parametrize(("built_in", "own"), [("dynamics", "smooth_dynamics"), ("reinforce", "weighted_regression")])
-def test_an_objective_of_ones_own_is_what_moves_the_actor_of_dreamer_v3(my_losses, built_in, own):
+@pytest.mark.parametrize(
+    ("built_in", "own", "metric"),
+    [("dynamics", "smooth_dynamics", "roughness"), ("reinforce", "weighted_regression", "entropy")],
+)
+def test_an_objective_of_ones_own_is_what_moves_the_actor_of_dreamer_v3(my_losses, built_in, own, metric):
     gradients = []
     for actor in (built_in, f"my_losses:{own}"):
         learner = learner_of(seed=0, actor=actor, **CONFIG)
         torch.nn.init.normal_(learner.agent.actor.mlp.output.weight, generator=torch.Generator().manual_seed(0))
         torch.manual_seed(1)
-        learner._backward(make_batch())
+        metrics = learner._backward(make_batch())
         gradients.append([parameter.grad for parameter in learner.agent.actor.parameters()])
+    assert metrics[metric] > 0
     assert not any(map(torch.equal, *gradients))
 
 
