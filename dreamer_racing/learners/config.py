@@ -16,6 +16,8 @@ class LearnerConfig:
         imagination_horizon: H, imagined actions from each start; also the horizon at which the world model's
             predictions are evaluated.
         imagination_starts: Number of random records of the batch from which imagination starts; None for all of them.
+        imagination_every: Actor and critic learn in imagination in every n-th update; in the others the world model
+            learns, and the critic from replayed returns. The reference has 1.
         average_rate: Rate of the exponential moving average of the weights, which evaluations and exports use; None
             keeps no average.
         slow_critic_rate: Fraction by which the slow critic moves towards the critic at each update.
@@ -36,6 +38,7 @@ class LearnerConfig:
 
     imagination_horizon: int = setting(HORIZON, COUNT)
     imagination_starts: int | None = setting(None, COUNT)
+    imagination_every: int = setting(1, COUNT)
     average_rate: float | None = setting(None, POSITIVE_SHARE)
     slow_critic_rate: float = setting(0.02, SHARE)
     cuda_graph: bool | None = None

@@ -16,6 +16,7 @@ from torchrl.modules import PercentileValueNorm
 
 from dreamer_racing import parallel
 from dreamer_racing.learners.config import LearnerConfig
+from dreamer_racing.learners.gradient_step import GraphedStep
 from dreamer_racing.learners.learner import Timer, untimed
 from dreamer_racing.learners.update import WorldModelLearner
 from dreamer_racing.losses import (
@@ -28,7 +29,6 @@ from dreamer_racing.losses import (
     imagine,
     lambda_return,
     open_loop_loss,
-    replay_critic_loss,
 )
 from dreamer_racing.modules import Agent
 from dreamer_racing.modules.heads import ActionDistribution
@@ -91,6 +91,11 @@ class DreamerV3(WorldModelLearner):
                 losses["loss_open_loop"] = open_loop_loss(model, latents, batch, numbers.open_loop_steps)
         self.store_latents(latents)
 
+        # Imagination takes more than half of an update's time, so it may be left out of some.
+        if self.updates % self.config.imagination_every:
+            with timed("imagine"):
+                return losses | self.replay_critic_losses(latents, batch)
+
         with timed("imagine"):
             # Imagination: starting from latents of the records, the policy acts H times in the world model.
             starts = choose_starts(
@@ -140,10 +145,7 @@ class DreamerV3(WorldModelLearner):
             # was a start, replayed returns bootstrap from its imagined return, which is better than the critic's value.
             shape = batch["terminated"].shape
             bootstrap = returns[0].detach().reshape(shape) if self.config.imagination_starts is None else None
-            replayed = latents.features if numbers.replay_value_gradient else latents.features.detach()
-            losses["loss_replay_critic"] = numbers.replay_value_scale * replay_critic_loss(
-                critic, replayed, batch, self.discount, numbers.lambda_, numbers.slow_critic_scale, bootstrap
-            )
+            losses |= self.replay_critic_losses(latents, batch, bootstrap)
             regression, logits = critic_loss(critic, features, returns.detach(), numbers.slow_critic_scale)
             losses["loss_critic"] = (weight * regression).mean()
 
@@ -190,6 +192,15 @@ class DreamerV3(WorldModelLearner):
     def state_dict(self) -> dict[str, Any]:
         """Return everything that the next update depends on, except the global random generators."""
         return {**super().state_dict(), "return_range": self.return_range.state_dict()}
+
+    def _make_graph(self) -> GraphedStep:
+        """Return ``_backward`` as a step that is replayed as one CUDA graph; see `WorldModelLearner`."""
+        if self.config.imagination_every != 1:
+            raise ValueError(
+                f"imagination_every={self.config.imagination_every} with cuda_graph=True: a graph does the same in "
+                "every update. Use imagination_every=1, or cuda_graph=False."
+            )
+        return super()._make_graph()
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
         """Restore what ``state_dict`` returned; see `WorldModelLearner.load_state_dict`."""

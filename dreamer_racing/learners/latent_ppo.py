@@ -35,7 +35,6 @@ from dreamer_racing.losses import (
     Trajectory,
     find_objective,
     normalized,
-    replay_critic_loss,
     rollout_return,
 )
 from dreamer_racing.losses.config import KL_TOLERANCE, PPOUpdateConfig
@@ -141,7 +140,6 @@ class LatentPPO(WorldModelLearner):
             batch: Replayed records ``[B, T]``.
             timed: Context manager by activity.
         """
-        numbers = self.loss_config
         # World model: infer the records' latents, predict rewards, episode ends and targets, and penalise changes of
         # the policy by changed latents.
         with timed("world_model"):
@@ -150,10 +148,7 @@ class LatentPPO(WorldModelLearner):
         self.store_latents(latents)
         # Agent's critic: its regression on replayed λ-returns also trains the latents to tell what returns depend on.
         with timed("imagine"):
-            features = latents.features if numbers.replay_value_gradient else latents.features.detach()
-            losses["loss_replay_critic"] = numbers.replay_value_scale * replay_critic_loss(
-                self.agent.critic, features, batch, self.discount, numbers.lambda_, numbers.slow_critic_scale
-            )
+            losses |= self.replay_critic_losses(latents, batch)
         return losses
 
     def update_actor(self) -> dict[str, Tensor]:

@@ -21,7 +21,7 @@ from dreamer_racing.learners.config import LearnerConfig
 from dreamer_racing.learners.gradient_step import FiniteGuard, GraphedStep, gradient_norms, make_optimizer, restore
 from dreamer_racing.learners.learner import Timer, ValueFunction, seeded, untimed
 from dreamer_racing.learners.saved import UnmatchedWeights, check_saved, check_weights, load_parameters, own_state
-from dreamer_racing.losses import Latents, LossConfig, WorldModelLoss, find_targets, policy_drift
+from dreamer_racing.losses import Latents, LossConfig, WorldModelLoss, find_targets, policy_drift, replay_critic_loss
 from dreamer_racing.modules import Agent, DreamerPolicy, Interface, ModelSize, get_size
 from dreamer_racing.modules.few_kernels import cast_once, use_few_kernels
 from dreamer_racing.modules.layers import autocast
@@ -220,6 +220,25 @@ class WorldModelLearner(ABC):
         before, after, same = self.stored_and_current_features(latents, batch)
         drift = policy_drift(self.agent.actor, before, after, same.float())
         return {"loss_drift": scale * drift, "policy_drift": drift.detach()}
+
+    def replay_critic_losses(
+        self, latents: Latents, batch: TensorDictBase, bootstrap: Tensor | None = None
+    ) -> dict[str, Tensor]:
+        """Return ``loss_replay_critic`` of a batch ``[B, T]``: the agent's critic learns its λ-returns.
+
+        With ``replay_value_gradient`` the latents learn to tell what these depend on, too.
+
+        Args:
+            latents: Current latents of the batch's records.
+            batch: The records.
+            bootstrap: Values ``(B, T, 1)`` with which the returns continue; None for the critic's own.
+        """
+        numbers = self.loss_config
+        features = latents.features if numbers.replay_value_gradient else latents.features.detach()
+        loss = replay_critic_loss(
+            self.agent.critic, features, batch, self.discount, numbers.lambda_, numbers.slow_critic_scale, bootstrap
+        )
+        return {"loss_replay_critic": numbers.replay_value_scale * loss}
 
     def stored_and_current_features(self, latents: Latents, batch: TensorDictBase) -> tuple[Tensor, Tensor, Tensor]:
         """Return the stored and the current features of the same records.

@@ -46,6 +46,7 @@ def check_read(config: DictConfig, overrides: Sequence[str]) -> None:
         ("loss.privileged_scale", have(State), "loss=privileged or informed"),
         ("loss.barlow_scale", have(Barlow), "loss=decoder_free"),
         ("model.imagination_starts", config.algorithm == "dreamer_v3", "recipes/dreamer_v3.py, which imagines"),
+        ("model.imagination_every", config.algorithm == "dreamer_v3", "recipes/dreamer_v3.py, which imagines"),
         ("loss.drift_scale", drift, "stored latents (replay.context=true) without sampling (model.sampled=false)"),
         ("replay.recent_records", config.replay.recent_share > 0, "replay.recent_share above 0"),
         ("replay.device", config.replay.storage is Storage.tensor, "replay.storage=tensor"),

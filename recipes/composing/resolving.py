@@ -209,5 +209,6 @@ def disable_drift_loss(config: DictConfig) -> None:
 
 
 def can_capture_graph(config: DictConfig, device: torch.device) -> bool:
-    """Return whether updates can be captured as a CUDA graph: not if processes exchange data in its middle."""
-    return device.type == "cuda" and (parallel.asked_for() == 1 or config.algorithm == "latent_ppo")
+    """Return whether updates can be captured as a CUDA graph: all are alike, and processes exchange no data in them."""
+    alone = parallel.asked_for() == 1 or config.algorithm == "latent_ppo"
+    return device.type == "cuda" and alone and config.model.imagination_every == 1

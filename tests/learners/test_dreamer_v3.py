@@ -253,6 +253,27 @@ def test_imagination_may_start_from_a_subset():
     assert metrics["loss_replay_critic"].isfinite()
 
 
+def test_between_imaginations_the_world_model_and_the_critic_learn_but_not_the_actor():
+    learner = learner_of(seed=0, **CONFIG | {"imagination_every": 2})
+    learner.update(make_batch())  # imagines
+    seen, before = watch(learner), copy.deepcopy(learner.agent)
+    metrics = learner.update(make_batch())
+    assert not seen
+    assert not {"loss_actor", "loss_critic", "gradient_norm/actor"} & metrics.keys()
+    same = {
+        name: all(map(torch.equal, network.parameters(), getattr(before, name).parameters()))
+        for name, network in learner.agent.named_children()
+    }
+    assert same == {"world_model": False, "actor": True, "critic": False}
+    assert "loss_actor" in learner.update(make_batch())
+    assert len(seen) == 1
+
+
+def test_a_cuda_graph_cannot_leave_imagination_out_of_some_updates():
+    with pytest.raises(ValueError, match=r"imagination_every=2 with cuda_graph=True.*imagination_every=1, or"):
+        learner_of(seed=0, **CONFIG | {"imagination_every": 2, "cuda_graph": True})
+
+
 def test_every_terminal_record_is_a_start_of_no_weight():
     learner = learner_of(seed=0, **CONFIG)
     seen = watch(learner)
