@@ -20,6 +20,7 @@ from dreamer_racing.export.actor_step import WEIGHTS
 from dreamer_racing.export.contract import describe_camera, hash_tensors
 from dreamer_racing.export.onnx_actor import CONTRACT, PARTS, read_contract
 from dreamer_racing.export.weights_file import read_weights
+from dreamer_racing.learners.saved import check_size
 from dreamer_racing.modules import DreamerPolicy, Interface, ModelSize
 from dreamer_racing.modules.agent import Agent
 from dreamer_racing.settings import check_choice
@@ -149,6 +150,20 @@ class ShippedAgent:
 
     def value_function(self) -> None:
         """Return None, because an agent folder has no critic."""
+
+
+def load_trained(folder: Path, env: DroneRacingEnv, *agents: Agent) -> None:
+    """Load the weights of an agent folder into agents that go on training in an environment, as `load_networks`.
+
+    Raises:
+        ValueError: The agents have another size, or the environment differs from that of training.
+    """
+    contract = read_contract(folder / CONTRACT)
+    for agent in agents:
+        check_size(contract["model"], agent.size)
+    check_env(folder, contract, env)
+    for agent in agents:
+        load_networks(folder, agent)
 
 
 def load_networks(folder: Path, agent: Agent) -> None:

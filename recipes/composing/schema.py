@@ -294,6 +294,13 @@ class LatentPPORunConfig(WorldModelRunConfig):
         """Configurations whose settings the schedule changes, by their dotted names."""
         return super().scheduled | {"loss.ppo": self.loss.ppo}
 
+    @property
+    def newest_records(self) -> int:
+        """Records of each world on which the model's error decides whether the actor waits."""
+        length = self.model.batch_length
+        # Windows that begin with stored latents: the newest rollout suffices.
+        return min(length, self.rollout_steps) if self.replay.context else length
+
     def check(self) -> None:
         """Check as `WorldModelRunConfig.check`, and refuse objectives of imagined steps."""
         super().check()
