@@ -16,7 +16,7 @@ from typing import Any, cast
 
 from composing.building import make_evaluator, shared_env_arguments
 from composing.entry import plain_disk_errors, plain_errors, recipe
-from composing.restoring import FlightConfig, Restored, report_heading, restore
+from composing.restoring import FlightConfig, Restored, restore
 
 from dreamer_racing.envs.race.starts import StartSampler
 from dreamer_racing.envs.tracks import Track
@@ -27,6 +27,7 @@ from dreamer_racing.evaluation.protocol import (
     PRESETS,
     Result,
     check_conditions,
+    report_heading,
     results_table,
     run_protocol,
 )

@@ -24,7 +24,6 @@ from typing import Any
 from composing.building import serialize_track_file, shared_env_arguments
 from composing.entry import as_override, override_key, override_value, plain_errors, recipe
 from composing.options import command
-from composing.restoring import config_folder, find_trained, results_of
 from composing.saved import trained_config
 from composing.schema import WorldModelRunConfig, is_race
 from omegaconf import MISSING, OmegaConf
@@ -51,8 +50,11 @@ from dreamer_racing.export.shipped_agent import (
     CONFIG,
     ShippedAgent,
     choose_weights,
+    config_folder,
+    find_trained,
     is_agent,
     load_agent,
+    results_of,
 )
 from dreamer_racing.modules import Interface
 from dreamer_racing.settings import COUNT, SEED, check_choice, setting

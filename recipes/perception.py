@@ -15,13 +15,13 @@ from typing import Any
 
 from composing.building import shared_env_arguments
 from composing.entry import plain_disk_errors, plain_errors, recipe
-from composing.restoring import FlightConfig, Restored, report_heading, restore
+from composing.restoring import FlightConfig, Restored, restore
 from composing.schema import RunConfig
 
 from dreamer_racing.envs.simulator.scene import Camera
 from dreamer_racing.envs.tracks import Track, decoys_for, with_decoys
 from dreamer_racing.evaluation.image_corruptions import CORRUPTIONS, CorruptedPolicy
-from dreamer_racing.evaluation.protocol import MODES, Result, fly, results_table
+from dreamer_racing.evaluation.protocol import MODES, Result, fly, report_heading, results_table
 from dreamer_racing.evaluation.sight import Sight, gate_table, measure_sight, sight_table
 from dreamer_racing.evaluation.trajectory import Trajectory
 from dreamer_racing.figures.protocol import plot_sight

@@ -17,6 +17,7 @@ import torch
 
 from dreamer_racing.envs.torchrl_env import DroneRacingEnv
 from dreamer_racing.export.actor_step import WEIGHTS
+from dreamer_racing.export.agents import agent_path, agents_that_ship
 from dreamer_racing.export.contract import describe_camera, hash_tensors
 from dreamer_racing.export.onnx_actor import CONTRACT, PARTS, read_contract
 from dreamer_racing.export.weights_file import read_weights
@@ -24,7 +25,8 @@ from dreamer_racing.learners.saved import check_size
 from dreamer_racing.modules import DreamerPolicy, Interface, ModelSize
 from dreamer_racing.modules.agent import Agent
 from dreamer_racing.settings import check_choice
-from dreamer_racing.training.checkpoint import load_state
+from dreamer_racing.training.checkpoint import load_state, newest_sound
+from dreamer_racing.training.directory import RunDirectory
 
 AGENT, CONFIG, ACTOR = "agent.json", "config.yaml", "actor.onnx"
 FILES = (ACTOR, WEIGHTS, CONTRACT, CONFIG, AGENT)
@@ -186,6 +188,37 @@ def load_networks(folder: Path, agent: Agent) -> None:
 def is_agent(folder: str | Path) -> bool:
     """Return whether a folder is an agent folder."""
     return (Path(folder) / AGENT).is_file()
+
+
+def find_trained(name: str) -> Path:
+    """Find the agent or checkpoint that `checkpoint=` or `agent=` names.
+
+    Args:
+        name: of an included agent; or path of an agent's folder, a run directory, or a checkpoint.
+
+    Returns:
+        The folder of the agent, or the newest checkpoint there.
+
+    Raises:
+        FileNotFoundError: there is neither; the message names the included agents.
+    """
+    path = agent_path(name)
+    if is_agent(path):
+        return path.absolute()
+    try:
+        return newest_sound(name, ("learner", "counters"))
+    except FileNotFoundError as error:
+        raise FileNotFoundError(f"{error} {agents_that_ship()}") from error
+
+
+def config_folder(checkpoint: Path) -> Path:
+    """Return the folder that holds the configuration of a checkpoint or an agent."""
+    return checkpoint if is_agent(checkpoint) else RunDirectory.of(checkpoint).path
+
+
+def results_of(checkpoint: Path) -> Path:
+    """Return the folder for results of a checkpoint or an agent."""
+    return Path("runs") / f"agent_{checkpoint.name}" if is_agent(checkpoint) else RunDirectory.of(checkpoint).path
 
 
 def read_about(folder: str | Path) -> dict[str, Any]:
