@@ -10,10 +10,7 @@ command continues an experiment that was interrupted: finished runs are skipped,
 """
 
 import os
-import signal
-import subprocess
 import sys
-import threading
 from collections.abc import Iterable
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -32,10 +29,10 @@ from yaml import YAMLError, safe_load
 
 from dreamer_racing.settings import check_choice, shortened
 from dreamer_racing.training.directory import RunDirectory, latest_checkpoint
+from dreamer_racing.training.signals import run_passing_signals
 
 FOLDER = Path(__file__).resolve().parent
 LOG = "log.txt"
-SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGUSR1, signal.SIGUSR2)
 EXPERIMENT_SETTINGS = ("name", "algorithm", "variant", "variants", "overrides", "directory")  # not for recipes
 
 # Launchers start processes that must find the modules of this folder.
@@ -101,8 +98,8 @@ def complete_run(config: ExperimentConfig, run_dir: Path, given: list[str]) -> N
     RunDirectory(run_dir).claim().release()  # refuses a live run here, rather than in its log
     began = "resumed" if any("resume=" in word for word in command) else "started"
     print(f"{run_dir}: {began}, budget={config.budget}", flush=True)
-    if status := run(command, run_dir):
-        log = run_dir / LOG
+    log = run_dir / LOG
+    if status := run_passing_signals(command, log):
         last = "\n".join(log.read_text(errors="replace").replace("\r", "\n").splitlines()[-5:])
         raise RuntimeError(f"{config.algorithm} ended with status {status}; {log} ends with:\n{last}")
     print(f"{run_dir}: {'done' if next_command(config, given) is None else 'interrupted'}", flush=True)
@@ -176,40 +173,6 @@ def settings_of(overrides: Iterable[str]) -> dict[str, Any]:
         except YAMLError as error:
             raise ValueError(f"The override {shortened(override)} has no value that can be read.") from error
     return values
-
-
-def run(command: list[str], run_dir: Path) -> int:
-    """Run a recipe in a process of its own, with its output in a file; return its exit status.
-
-    Signals are passed on as SIGTERM, so that the recipe saves and ends. Then this process ends too, or calls the
-    handler that the signal had before: that of a Slurm job queues the job again.
-    """
-    received: list[signal.Signals] = []
-    here = threading.current_thread()  # only the main thread may set handlers
-    before = {number: signal.getsignal(number) for number in SIGNALS} if here is threading.main_thread() else {}
-    if before.get(signal.SIGHUP) is signal.SIG_IGN:  # nohup
-        del before[signal.SIGHUP]
-    for number in before.keys() & {signal.SIGUSR1, signal.SIGUSR2}:
-        signal.signal(number, signal.SIG_IGN)  # inherited by the recipe, since Slurm signals every process
-    log = (run_dir / LOG).open("a", encoding="utf-8")
-    with log, subprocess.Popen(command, stdout=log, stderr=log, start_new_session=True) as process:
-
-        def pass_on(number: int, frame: object) -> None:
-            received.append(signal.Signals(number))
-            process.send_signal(signal.SIGTERM)
-
-        for number in before:
-            signal.signal(number, pass_on)
-        status = process.wait()
-    for number, handler in before.items():
-        signal.signal(number, handler)
-    if received:
-        print(f"{run_dir}: interrupted by {received[0].name}", flush=True)
-        handler = before[received[0]]
-        if received[0] in (signal.SIGUSR1, signal.SIGUSR2) and callable(handler):
-            handler(received[0], None)
-        raise SystemExit(128 + received[0])
-    return status
 
 
 if __name__ == "__main__":

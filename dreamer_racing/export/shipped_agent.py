@@ -16,6 +16,7 @@ from typing import Any
 import torch
 
 from dreamer_racing.envs.torchrl_env import DroneRacingEnv
+from dreamer_racing.evaluation.protocol import MODES
 from dreamer_racing.export.actor_step import WEIGHTS
 from dreamer_racing.export.agents import agent_path, agents_that_ship
 from dreamer_racing.export.contract import describe_camera, hash_tensors
@@ -30,6 +31,7 @@ from dreamer_racing.training.directory import RunDirectory
 
 AGENT, CONFIG, ACTOR = "agent.json", "config.yaml", "actor.onnx"
 FILES = (ACTOR, WEIGHTS, CONTRACT, CONFIG, AGENT)
+BY_ITEM = ("episodes", "crashes_by_gate")  # entries of an evaluation that agent.json leaves out
 AVERAGED, TRAINED = "averaged", "trained"
 CHOICES = ("auto", AVERAGED, TRAINED)
 """Choices of a checkpoint's weights: ``auto`` takes the averaged ones if the checkpoint has them."""
@@ -270,6 +272,55 @@ def check_env(folder: str | Path, contract: dict[str, Any], env: DroneRacingEnv)
                 f"{setting}={given}: the agent {folder} was trained with {setting}={trained}, and flies "
                 "with nothing else."
             )
+
+
+def newest_evaluation(folder: Path, weights_sha256: str, track_sha256: str) -> Path:
+    """Return a run's latest evaluation of these weights on this track; without one, a file that is refused when read.
+
+    Each evaluation has a folder of its own.
+    """
+    first = RunDirectory(folder).evaluation_file
+    there = first.parent.parent.glob(f"{first.parent.name}*/{first.name}")
+    texts = {path: path.read_text(encoding="utf-8") for path in there}
+    of_these = [path for path, text in texts.items() if f'"weights_sha256": "{weights_sha256}"' in text]
+    fitting = [path for path in of_these if f'"track_sha256": "{track_sha256}"' in texts[path]]
+    return max(fitting or of_these, key=lambda path: path.stat().st_mtime, default=first)
+
+
+def read_evaluation(
+    path: Path, checkpoint: Path, weights_sha256: str, track: str, track_sha256: str, how: str
+) -> dict[str, Any]:
+    """Return the statistics of an evaluation of these weights on the track that they were trained on, for agent.json.
+
+    Args:
+        path: evaluation.json.
+        checkpoint: Checkpoint of the agent, for messages.
+        weights_sha256: Hash of the weights.
+        track: Track that the agent was trained on, for messages.
+        track_sha256: Hash of that track.
+        how: A sentence that says how to make the evaluation, for messages.
+
+    Raises:
+        FileNotFoundError: There is none.
+        ValueError: It is of other weights or another track, or no evaluation.
+    """
+    if not path.is_file():
+        raise FileNotFoundError(f"There is no evaluation {path}: an agent ships with its results. {how}")
+    try:
+        written = json.loads(path.read_text(encoding="utf-8"))
+        made = written["provenance"]
+    except (ValueError, KeyError, TypeError) as error:
+        raise ValueError(f"{path} is not an evaluation by recipes/evaluate.py ({error!r}). {how}") from error
+    if made.get("weights_sha256") != weights_sha256:
+        raise ValueError(f"{path} is an evaluation of other weights than those of {checkpoint}. {how}")
+    if made.get("track_sha256") is None:
+        raise ValueError(f"{path} does not say which track it was flown on. {how}")
+    if made["track_sha256"] != track_sha256:
+        there = "another track, or with other decoys" if made["track"] == track else made["track"]
+        raise ValueError(f"{path} was flown on {there}, and the agent was trained on {track}. {how}")
+    names = ("episodes", "seed", "start_noise", "preset", "decoys", "date", "commit")
+    statistics = {mode: {name: value for name, value in written[mode].items() if name not in BY_ITEM} for mode in MODES}
+    return {**{name: made[name] for name in names}, **statistics}
 
 
 def _size(saved: dict[str, Any]) -> ModelSize:
