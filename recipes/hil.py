@@ -13,7 +13,6 @@ Read docs/hil_safety.md before anything with propellers. Only actor=pilot and re
 """
 
 import json
-import math
 import sys
 from collections.abc import Callable
 from contextlib import ExitStack, closing
@@ -28,8 +27,8 @@ from omegaconf.errors import OmegaConfBaseException
 
 from dreamer_racing.envs.tracks import Track, describe_track, load_track
 from dreamer_racing.export.agents import existing_agent_path
-from dreamer_racing.hil.battery import STALE
-from dreamer_racing.hil.chain import FlightChain, Outputs, describe_outputs, read_inputs
+from dreamer_racing.hil.battery import battery_words
+from dreamer_racing.hil.chain import FlightChain, Outputs, first_difference
 from dreamer_racing.hil.configuration import (
     IDENTIFY,
     PILOT,
@@ -171,22 +170,19 @@ def conclude(config: HilConfig, flight: Prepared, ended: str) -> dict[str, Any]:
         "loop": flight.loop.statistics.summary(),
         "poses": {"rejected": flight.poses.rejected, "out_of_order": chain.clock.out_of_order},
         "commands_dropped": flight.link.dropped,
-        "battery": battery_summary(config, chain, flight.link),
+        "battery": None,
     }
+    if (thrust := flight.link.thrust) is not None:
+        readings = {"readings": 0} if chain.battery is None else chain.battery.summary()
+        summary["battery"] = {
+            "voltage_set": config.voltage,
+            "voltage": thrust.voltage,
+            "rejected": flight.link.rejected,
+            **readings,
+        }
     if config.record:
         (flight.folder / STATISTICS).write_text(json.dumps(summary, indent=2) + "\n", encoding="utf-8")
     return summary
-
-
-def battery_summary(config: HilConfig, chain: FlightChain, link: TransportLink) -> dict[str, Any] | None:
-    """Return the thrust map's voltage at the end, and counts of battery readings; None without a thrust map."""
-    if link.thrust is None:
-        return None
-    summary = {"voltage_set": config.voltage, "voltage": link.thrust.voltage, "rejected": link.rejected}
-    if (battery := chain.battery) is None:
-        return {**summary, "readings": 0}
-    age = battery.age if math.isfinite(battery.age) else None
-    return {**summary, "readings": battery.readings, "implausible": battery.implausible, "last_reading_age_s": age}
 
 
 def as_json(config: HilConfig) -> dict[str, Any]:
@@ -207,17 +203,7 @@ def say(summary: dict[str, Any]) -> None:
     if rejected or out_of_order:
         print(f"poses ignored: {rejected} invalid messages, {out_of_order} out of order")
     if summary["battery"] is not None:
-        print(in_words(summary["battery"]))
-
-
-def in_words(battery: dict[str, Any]) -> str:
-    """Return, in words, the voltage that the thrust map used, and where it came from."""
-    if not battery["readings"]:
-        return f"battery: no usable reading; thrust was computed with voltage={battery['voltage_set']:g}"
-    age = battery["last_reading_age_s"]
-    old = f", the last one {age:.1f} s before the end: STALE" if age > STALE else ""
-    left_out = f", {battery['implausible']} implausible ones ignored" if battery["implausible"] else ""
-    return f"battery: {battery['voltage']:.2f} V at the end, from {battery['readings']} readings{left_out}{old}"
+        print(battery_words(summary["battery"]))
 
 
 def replay(config: HilConfig) -> int:
@@ -239,29 +225,13 @@ def replay(config: HilConfig) -> int:
     flyer, _ = make_flyer(settings, track)
     settings.renderer = config.renderer
     with closing(make_chain(settings, flyer, track)) as chain:
-        return play(flight, chain)
-
-
-def play(flight: Flight, chain: FlightChain) -> int:
-    """Pass every tick of a flight through a chain; return 0 if all outputs are as recorded, else 1."""
-    chain.warm_up()
-    for index, tick in enumerate(flight.ticks):
-        again = json.loads(json.dumps(describe_outputs(chain.tick(read_inputs(tick["in"])))))
-        if differing := [name for name, value in tick["out"].items() if not same(value, again.get(name))]:
-            name = differing[0]
-            print(f"tick {index}: {name} was {tick['out'][name]}, and is {again.get(name)} now", file=sys.stderr)
-            return 1
+        chain.warm_up()
+        difference = first_difference(chain, flight.ticks)
+    if difference:
+        print(difference, file=sys.stderr)
+        return 1
     print(f"replayed: {len(flight.ticks)} ticks, all equal to the recording{'' if flight.whole else ' (cut off)'}")
     return 0
-
-
-def same(one: Any, other: Any) -> bool:
-    """Return whether two JSON values are equal, bit for bit; NaN equals NaN."""
-    if isinstance(one, list) and isinstance(other, list):
-        return len(one) == len(other) and all(map(same, one, other))
-    if isinstance(one, float) and isinstance(other, float) and math.isnan(one):
-        return math.isnan(other)
-    return one == other
 
 
 def report(config: HilConfig) -> int:

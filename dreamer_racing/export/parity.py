@@ -18,7 +18,6 @@ from torch import Tensor
 
 from dreamer_racing.envs.policy_memory import with_memory
 from dreamer_racing.envs.torchrl_env import DroneRacingEnv
-from dreamer_racing.export.actor_step import ActorStep
 from dreamer_racing.export.onnx_actor import CONTRACT, OnnxActor, RecurrentActor, measure_latency, read_contract
 from dreamer_racing.modules import DreamerPolicy
 from dreamer_racing.modules.agent import Agent
@@ -159,11 +158,13 @@ def check_parity(actors: Mapping[str, RecurrentActor], flight: RecordedFlight, s
         raise ParityError(f"{error} {hint}") from None
 
 
-def measure_latencies(step: ActorStep, flight: RecordedFlight, output: Path, parts: bool) -> Iterator[str]:
+def measure_latencies(
+    step: Callable[..., Sequence[Tensor]], flight: RecordedFlight, output: Path, parts: bool
+) -> Iterator[str]:
     """Yield lines on how long a step takes with one thread.
 
     Args:
-        step: The step.
+        step: An `ActorStep`.
         flight: Observations for it.
         output: The exported actor.
         parts: Whether it was also exported in two parts: then also on the one from image to action.
