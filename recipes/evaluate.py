@@ -24,18 +24,12 @@ from dreamer_racing.evaluation.protocol import (
     CONDITIONS,
     EPISODES,
     MODES,
-    PRESETS,
     Result,
     check_conditions,
-    report_heading,
-    results_table,
     run_protocol,
 )
-from dreamer_racing.figures.film import onboard_beside_map, write_video
-from dreamer_racing.figures.hud import caption, race_words
-from dreamer_racing.figures.protocol import plot_conditions, plot_crashes
-from dreamer_racing.figures.report import EvaluationReport
-from dreamer_racing.figures.top_down import plot_top_down
+from dreamer_racing.figures.protocol import write_markdown
+from dreamer_racing.figures.report import EvaluationReport, report_condition
 from dreamer_racing.settings import COUNT, NOT_NEGATIVE, SEED, check_choice, setting
 from dreamer_racing.terminal import say
 from dreamer_racing.training.directory import EVALUATION, RunDirectory, fresh_directory, replace_text
@@ -132,40 +126,17 @@ def evaluate_fully(config: EvaluateConfig, restored: Restored, directory: Path) 
         results.append(result)
         say(f"\n{result.preset}, {result.condition}, {result.mode} policy\n{result.evaluation.summary()}")
         if result.preset == trained.env.preset:
-            write_flight(directory, result, config.video_steps)
+            report_condition(RunDirectory(directory), result, config.video_steps)
         path = RunDirectory(directory).evaluations / f"{result.name}.json"
         path.parent.mkdir(exist_ok=True)
         path.write_text(result.evaluation.to_json())
     return results
 
 
-def write_flight(directory: Path, result: Result, video_steps: int) -> None:
-    """Plot the first flight of a condition from above; film it, if it has images and the policy is deterministic."""
-    trajectory = result.evaluation.trajectories[0]
-    plot_top_down(result.track, trajectory, RunDirectory(directory).plots / f"{result.name}.png")
-    if trajectory.pixels is not None and result.mode == "deterministic":
-        frames = onboard_beside_map(result.track, trajectory.part(0, min(video_steps, len(trajectory.action))))
-        film = caption(frames, race_words(result.track, trajectory)[: len(frames)])
-        write_video(RunDirectory(directory).videos / f"{result.name}.mp4", film, fps=round(1 / trajectory.control_dt))
-
-
 def describe(results: list[Result], preset: str) -> dict[str, Any]:
     """Return the contents of evaluation.json: the nominal race as with protocol=nominal, and all conditions."""
     nominal = {r.mode: r.evaluation.to_dict() for r in results if r.preset == preset and r.condition == "nominal"}
     return {**nominal, "conditions": [result.to_dict() for result in results]}
-
-
-def write_markdown(directory: Path, results: list[Result], provenance: dict[str, Any]) -> None:
-    """Write the table of conditions with its two plots."""
-    title = f"{provenance['algorithm']} on {provenance['track']}, {provenance['env_steps']:,} env_steps"
-    plot_conditions(results, RunDirectory(directory).plots / "conditions.png", title)
-    for preset in dict.fromkeys(result.preset for result in results):
-        flown = {r.mode: r.evaluation for r in results if r.preset == preset and r.condition == "nominal"}
-        plot_crashes(flown, RunDirectory(directory).plots / f"crashes_{preset}.png", f"{title}, nominal, {preset}")
-    meanings = "\n".join(f"- `{condition.name}`: {condition.meaning}" for condition in CONDITIONS)
-    plots = "\n\n".join(f"![{name}](plots/{name}.png)" for name in ("conditions", *(f"crashes_{p}" for p in PRESETS)))
-    text = f"{report_heading(title, provenance)}\n{results_table(results)}\n{meanings}\n\n{plots}\n"
-    (directory / "evaluation.md").write_text(text, encoding="utf-8")
 
 
 if __name__ == "__main__":

@@ -12,14 +12,10 @@ import logging
 import math
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from composing.entry import plain_errors, recipe
 
 from dreamer_racing.envs.drone.variations import SUFFIXES
-
-if TYPE_CHECKING:
-    from dreamer_racing.identification.fitting import Fit
 
 
 @dataclass
@@ -68,23 +64,8 @@ def identify(config: IdentificationConfig) -> None:
     if not all(math.isfinite(error) for error in found.errors.values()):
         raise ValueError("The fit diverged: start from a preset= closer to the drone.")
     save_drone(Path(config.output), found.parameters, about)
-    say(config, found)
-
-
-def say(config: IdentificationConfig, found: "Fit") -> None:
-    """Print the fitted parameters."""
-    print(f"{'':<10}{'relative':>10}{'±':>8}  (to {config.preset}; delay in ms, added)")
-    for name, value in found.values.items():
-        scale = 1e3 if name == "delay" else 1.0
-        width = scale * found.deviations[name] * (1.0 if name == "delay" else value)
-        remark = "   poorly determined" if name in found.unknown else ""
-        print(f"{name:<10}{scale * value:>10.3f}{width:>8.3f}{remark}")
-    for axis, error in found.errors.items():
-        print(f"{axis}: RMS error of body rates {error:.1%} of the commanded rates ({found.before[axis]:.1%} before)")
-    if found.thrust is None:
-        print("thrust: no force was measured")
-    else:
-        print(f"thrust: {found.thrust:.3f} of the assumed thrust: multiply full_thrust= of recipes/hil.py by it")
+    for line in found.lines(config.preset):
+        print(line)
     print(f"written to {config.output}: env=betaflight env.preset={config.output}")
 
 

@@ -230,6 +230,11 @@ def results_table(results: Sequence[Result], condition: str = "condition") -> st
                 crashes_in_words(flown),
             )
         )
+    return as_markdown(rows)
+
+
+def as_markdown(rows: Sequence[Sequence[str]]) -> str:
+    """Return the rows of a table in Markdown."""
     return "\n".join("| " + " | ".join(row) + " |" for row in rows) + "\n"
 
 

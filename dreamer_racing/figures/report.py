@@ -18,6 +18,7 @@ from dreamer_racing.envs.tracks import Track
 from dreamer_racing.evaluation.course import Course, act
 from dreamer_racing.evaluation.dreams import Painter, dream, find_painter, record_dream
 from dreamer_racing.evaluation.evaluate import Evaluation, Trajectory, split_episodes
+from dreamer_racing.evaluation.protocol import Result
 from dreamer_racing.evaluation.trajectory import write_flight
 from dreamer_racing.figures.film import (
     GIF_SIZE,
@@ -242,6 +243,16 @@ def dream_beside_flight(learner: WorldModelLearner, trajectory: Trajectory, pain
         dreamt = dream(learner, trajectory, painter, [part], seen)[0]
         shown.append(torch.as_tensor(side_by_side(pixels[part], dreamt, seen)))
     return torch.cat(shown)
+
+
+def report_condition(into: RunDirectory, result: Result, video_steps: int) -> None:
+    """Plot the first flight of a condition from above; film it, if it has images and the policy is deterministic."""
+    trajectory = result.evaluation.trajectories[0]
+    plot_top_down(result.track, trajectory, into.plots / f"{result.name}.png")
+    if trajectory.pixels is not None and result.mode == "deterministic":
+        frames = onboard_beside_map(result.track, trajectory.part(0, min(video_steps, len(trajectory.action))))
+        film = caption(frames, race_words(result.track, trajectory)[: len(frames)])
+        write_video(into.videos / f"{result.name}.mp4", film, fps=round(1 / trajectory.control_dt))
 
 
 def report_flight(directory: Path, track: Track, result: Evaluation) -> str:
