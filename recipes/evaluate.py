@@ -20,14 +20,7 @@ from composing.restoring import FlightConfig, Restored, restore
 
 from dreamer_racing.envs.race.starts import StartSampler
 from dreamer_racing.envs.tracks import Track
-from dreamer_racing.evaluation.protocol import (
-    CONDITIONS,
-    EPISODES,
-    MODES,
-    Result,
-    check_conditions,
-    run_protocol,
-)
+from dreamer_racing.evaluation.protocol import CONDITIONS, EPISODES, MODES, Result, check_conditions, run_protocol
 from dreamer_racing.figures.protocol import write_markdown
 from dreamer_racing.figures.report import EvaluationReport, report_condition
 from dreamer_racing.settings import COUNT, NOT_NEGATIVE, SEED, check_choice, setting

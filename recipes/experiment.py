@@ -72,12 +72,6 @@ def main(settings: ExperimentConfig) -> None:
         note.write_text(f"{error}\n", encoding="utf-8")
 
 
-def check(config: ExperimentConfig) -> None:
-    """Refuse an unknown algorithm or variant."""
-    for name, known in (("algorithm", tuple(RECIPES)), ("variant", tuple(config.variants))):
-        check_choice(name, getattr(config, name), known)
-
-
 def directory_of(config: ExperimentConfig) -> Path:
     """Return the directory of one run."""
     name = f"{config.algorithm}_{Path(config.track).stem}_{config.variant}_seed{config.seed}"
@@ -115,7 +109,8 @@ def next_command(config: ExperimentConfig, given: list[str]) -> list[str] | None
     Raises:
         ValueError: the algorithm or the variant is unknown, or the directory holds a run with other settings.
     """
-    check(config)
+    for name, known in (("algorithm", tuple(RECIPES)), ("variant", tuple(config.variants))):
+        check_choice(name, getattr(config, name), known)
     run_dir = directory_of(config)
     chosen = [f"track={config.track}", f"seed={config.seed}", f"budget={config.budget}", *config.overrides]
     of_recipe = [override for override in given if override_key(override).partition(".")[0] not in EXPERIMENT_SETTINGS]
@@ -127,25 +122,17 @@ def next_command(config: ExperimentConfig, given: list[str]) -> list[str] | None
         latest_checkpoint(RunDirectory(run_dir).checkpoints)
     except FileNotFoundError:
         return [*recipe, as_override("run_dir", run_dir), *overrides]
-    refuse_other_settings(run_dir, overrides)
-    if tuned := tuned_by_recipe(run_dir, overrides):
-        wanted = cast(RunConfig, compose(config.algorithm, [*overrides, tuned]))
+    saved, given_now = settings_of(read_yaml(RunDirectory(run_dir).overrides, ListConfig)), settings_of(overrides)
+    refuse_other_settings(run_dir, saved, given_now)
+    if "tuned" in saved and "tuned" not in given_now:  # chosen for tuned=auto; it changes the run's length
+        wanted = cast(RunConfig, compose(config.algorithm, [*overrides, f"tuned={saved['tuned']}"]))
     if RunDirectory(run_dir).finished_env_steps() >= wanted.total_env_steps:
         return None
     return [*recipe, as_override("resume", run_dir), f"total_env_steps={wanted.total_env_steps}"]
 
 
-def tuned_by_recipe(run_dir: Path, overrides: list[str]) -> str | None:
-    """Return the override that the run's recipe chose for tuned=auto, because it changes the run's length."""
-    if "tuned" in settings_of(overrides):
-        return None
-    saved = settings_of(read_yaml(RunDirectory(run_dir).overrides, ListConfig))
-    return f"tuned={saved['tuned']}" if "tuned" in saved else None
-
-
-def refuse_other_settings(run_dir: Path, overrides: list[str]) -> None:
+def refuse_other_settings(run_dir: Path, saved: dict[str, Any], wanted: dict[str, Any]) -> None:
     """Refuse to resume a run that was started with other overrides, except for its length."""
-    saved, wanted = settings_of(read_yaml(RunDirectory(run_dir).overrides, ListConfig)), settings_of(overrides)
     saved = {name: value for name, value in saved.items() if name != "tuned" or name in wanted}  # chosen by tuned=auto
     differing = [name for name in sorted(saved.keys() | wanted.keys()) if saved.get(name) != wanted.get(name)]
     if differing:

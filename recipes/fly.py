@@ -86,7 +86,11 @@ class FlyConfig:
         if self.viewer and self.view == "chase":
             raise ValueError("viewer=true and view=chase, which films the flight: give one of them.")
         if self.viewer:
-            check_display(self)
+            try:
+                check_window()
+            except ViewerUnavailableError as error:
+                instead = f"leave out viewer=true for a video, a GIF and a plot in {self.run_dir}"
+                raise ValueError(f"{error}; {instead}.") from error
 
 
 @recipe("fly", FlyConfig)
@@ -97,20 +101,6 @@ def main(config: FlyConfig) -> None:
         watch(config)
     else:
         fly(config)
-
-
-def check_display(config: FlyConfig) -> None:
-    """Refuse viewer=true if no window can be opened, and name the alternative.
-
-    Raises:
-        ValueError: no window can be opened here.
-    """
-    try:
-        check_window()
-    except ViewerUnavailableError as error:
-        raise ValueError(
-            f"{error}; leave out viewer=true for a video, a GIF and a plot in {config.run_dir}."
-        ) from error
 
 
 @dataclass

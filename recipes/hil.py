@@ -27,7 +27,6 @@ from omegaconf.errors import OmegaConfBaseException
 
 from dreamer_racing.envs.tracks import Track, describe_track, load_track
 from dreamer_racing.export.agents import existing_agent_path
-from dreamer_racing.hil.battery import battery_words
 from dreamer_racing.hil.chain import FlightChain, Outputs, first_difference
 from dreamer_racing.hil.configuration import (
     IDENTIFY,
@@ -48,7 +47,7 @@ from dreamer_racing.hil.flyer import ActorFlyer, Flyer, trained_track
 from dreamer_racing.hil.identify import IdentificationFlyer
 from dreamer_racing.hil.links import make_link
 from dreamer_racing.hil.links.link import TransportLink
-from dreamer_racing.hil.loop import FlightLoop
+from dreamer_racing.hil.loop import FlightLoop, summary_lines
 from dreamer_racing.hil.pose import PoseSource
 from dreamer_racing.hil.pose_sources import make_poses
 from dreamer_racing.hil.progress import flying_laps
@@ -104,7 +103,7 @@ def fly(config: HilConfig) -> int:
         with plain_hil_errors():
             opened.close()
             summary = conclude(config, flight, ended)
-    say(summary)
+    print(*summary_lines(summary), sep="\n")
     wanted = 0 if config.laps is None else config.laps * flight.track.num_gates
     flown = flight.loop.flew and len(summary["passes"]) >= wanted
     return 0 if flown and not ended.startswith("cut") else 1
@@ -188,22 +187,6 @@ def conclude(config: HilConfig, flight: Prepared, ended: str) -> dict[str, Any]:
 def as_json(config: HilConfig) -> dict[str, Any]:
     """Return the configuration as JSON values."""
     return cast(dict[str, Any], OmegaConf.to_container(OmegaConf.structured(config), enum_to_str=True))
-
-
-def say(summary: dict[str, Any]) -> None:
-    """Print the summary of a flight."""
-    laps = ", ".join(f"{lap:.2f} s" for lap in summary["laps"]) or "none"
-    print(f"ended: {summary['ended']}")
-    print(f"gates passed: {len(summary['passes'])}, laps, from first gate to first gate: {laps}")
-    for name, row in summary["loop"].items():
-        if isinstance(row, dict):
-            print(f"{name:<9} p50 {row['p50_ms']:6.2f} ms   p99 {row['p99_ms']:6.2f} ms   max {row['max_ms']:6.2f} ms")
-    print(f"ticks: {summary['loop']['ticks']}, overruns: {summary['loop']['overruns']}")
-    rejected, out_of_order = summary["poses"]["rejected"], summary["poses"]["out_of_order"]
-    if rejected or out_of_order:
-        print(f"poses ignored: {rejected} invalid messages, {out_of_order} out of order")
-    if summary["battery"] is not None:
-        print(battery_words(summary["battery"]))
 
 
 def replay(config: HilConfig) -> int:

@@ -175,10 +175,7 @@ def to_checked_object(config: DictConfig) -> Any:
 def schema_alone(name: str) -> dict[str, Any]:
     """Return the primary configuration of a recipe without a YAML file: its schema, and no groups."""
     silent = [{f"override hydra/{kind}_logging": "none"} for kind in ("job", "hydra")]
-    return {
-        "defaults": [f"{name}_schema", "_self_", *silent],
-        "hydra": {"output_subdir": None, "run": {"dir": "."}},
-    }
+    return {"defaults": [f"{name}_schema", "_self_", *silent], "hydra": {"output_subdir": None, "run": {"dir": "."}}}
 
 
 def normalise_argument(argument: str) -> str:

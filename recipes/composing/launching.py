@@ -15,13 +15,7 @@ from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig, ListConfig, OmegaConf
 
 from composing.checks import check_overrides, check_read
-from composing.entry import (
-    as_override,
-    merge_overrides,
-    override_key,
-    override_value,
-    plain_errors,
-)
+from composing.entry import as_override, merge_overrides, override_key, override_value, plain_errors
 from composing.options import command
 from composing.resolving import tune
 from composing.saved import (
@@ -40,12 +34,7 @@ from dreamer_racing.export.agents import agent_path
 from dreamer_racing.export.shipped_agent import is_agent
 from dreamer_racing.figures.loggers import RunLogger, make_loggers
 from dreamer_racing.learners.gradient_step import NonFiniteLossError
-from dreamer_racing.machine import (
-    git_commit,
-    is_out_of_memory,
-    keep_freed_memory,
-    out_of_memory_advice,
-)
+from dreamer_racing.machine import git_commit, is_out_of_memory, keep_freed_memory, out_of_memory_advice
 from dreamer_racing.terminal import follow_quietly, start_logging
 from dreamer_racing.training.checkpoint import RunCheckpointError, newest_sound
 from dreamer_racing.training.directory import PREFIX, RunDirectory, env_steps_of, latest_checkpoint, replace_text

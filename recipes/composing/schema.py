@@ -130,11 +130,8 @@ class RunConfig:
             StartSampler(track, start_noise=noise)
         except ValueError as error:
             raise ValueError(f"evaluation.{error}") from error
-        if env.start_on_line == 1 and env.start_beyond_gate and not self.schedules_start_on_line:
-            raise ValueError(
-                f"env.start_beyond_gate={env.start_beyond_gate:g} is a share of the episodes that do not begin on the "
-                "racing line, and env.start_on_line=1 leaves none: lower that, or set env.start_beyond_gate=0."
-            )
+        if not self.schedules_start_on_line:
+            env.check_shares()
 
 
 @dataclass
@@ -328,13 +325,7 @@ class PPORunConfig(RunConfig):
     def check(self) -> None:
         """Check as `RunConfig.check`, and refuse more minibatches than a rollout has records."""
         super().check()
-        records = self.env.num_envs * self.rollout_steps
-        if self.ppo.minibatches > records:
-            raise ValueError(
-                f"ppo.minibatches={self.ppo.minibatches} are more than the {records} records of a rollout, "
-                f"env.num_envs={self.env.num_envs} times rollout_steps={self.rollout_steps}: lower the one, or "
-                "raise the others."
-            )
+        self.ppo.check(self.env.num_envs, self.rollout_steps)
 
 
 @dataclass
