@@ -92,10 +92,7 @@ def check_devices(devices: Mapping[str, str]) -> None:
     """Refuse more processes than this machine has CUDA devices, and the same device for all of them.
 
     Args:
-        devices: Devices by the names of their settings.
-
-    Raises:
-        ValueError: The message names the setting.
+        devices: Devices by the names of their settings, which the message gives.
     """
     here, there = num_local_processes(), torch.cuda.device_count()
     for name, device in devices.items():

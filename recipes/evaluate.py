@@ -12,9 +12,9 @@ docs/evaluation.md, with both presets of physics, and adds evaluation.md. An ear
 import json
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, cast
+from typing import Any
 
-from composing.building import make_evaluator, shared_env_arguments
+from composing.building import shared_env_arguments
 from composing.entry import plain_disk_errors, plain_errors, recipe
 from composing.restoring import FlightConfig, Restored, restore
 
@@ -58,7 +58,12 @@ def main(config: EvaluateConfig) -> None:
         refuse_races(config, restored.trained.saved_track())
         directory = fresh_directory(config.run_dir or RunDirectory(restored.run_dir).evaluation, EVALUATION)
         print(f"race: {restored.trained.track}, {restored.trained.env.preset}, {config.episodes} episodes")
-        report = make_nominal_report(config, restored, directory) if config.protocol == "nominal" else None
+        report = None
+        if config.protocol == "nominal":
+            worlds = {**shared_env_arguments(restored.trained), "start_noise": config.start_noise}
+            report = EvaluationReport(
+                directory, restored.flyer, worlds, config.episodes, config.video_steps, config.num_envs, config.seed
+            )
     with plain_disk_errors():
         if report:
             written = evaluate_nominal(report)
@@ -79,21 +84,6 @@ def refuse_races(config: EvaluateConfig, track: Track) -> None:
         check_conditions(CONDITIONS, track, config.seed)
     else:
         StartSampler(track, start_noise=config.start_noise)
-
-
-def make_nominal_report(config: EvaluateConfig, restored: Restored, directory: Path) -> EvaluationReport:
-    """Make the evaluation in the race that the policy was restored for."""
-    report = make_evaluator(
-        restored.trained,
-        directory,
-        restored.flyer,
-        config.episodes,
-        config.video_steps,
-        config.start_noise,
-        num_envs=config.num_envs,
-        seed=config.seed,
-    )
-    return cast(EvaluationReport, report)
 
 
 def evaluate_nominal(report: EvaluationReport) -> dict[str, Any]:

@@ -38,7 +38,7 @@ from dreamer_racing.figures.report import EvaluationReport, ReturnReport
 from dreamer_racing.learners import NetworkSize, PPOLearner, SACLearner
 from dreamer_racing.learners.dreamer_v3 import DreamerV3
 from dreamer_racing.learners.latent_ppo import LatentPPO
-from dreamer_racing.learners.learner import Evaluable, Learner, Policy
+from dreamer_racing.learners.learner import Learner, Policy
 from dreamer_racing.learners.update import WorldModelLearner
 from dreamer_racing.losses import find_targets
 from dreamer_racing.modules import Agent, Interface, ModelSize, get_size
@@ -126,22 +126,17 @@ def make_suite(config: RunConfig, num_envs: int, seed: int, episode_steps: int |
     )
 
 
-def make_evaluator(
-    config: RunConfig,
-    directory: Path,
-    learner: Evaluable,
-    episodes: int,
-    video_steps: int,
-    start_noise: float = 0.0,
-    **options: Any,
-) -> Evaluator:
-    """Make the evaluator for the run's environment; in a race, `options` go to `EvaluationReport`."""
+def make_evaluator(config: RunConfig, directory: Path, learner: Learner) -> Evaluator:
+    """Make the evaluator used during training; processes other than the first get one that does nothing."""
+    if not parallel.is_first():
+        return NoReport()
+    asked = config.evaluation
     if is_race(config):
-        worlds = {**shared_env_arguments(config), "start_noise": start_noise}
-        return EvaluationReport(directory, learner, worlds, episodes, video_steps, **options)
+        worlds = {**shared_env_arguments(config), "start_noise": asked.start_noise}
+        return EvaluationReport(directory, learner, worlds, asked.episodes, asked.video_steps)
     seed = config.seed + 1
-    env = make_suite(config, min(8, episodes), seed)
-    return ReturnReport(directory, learner, env, episodes, video_steps, seed)
+    env = make_suite(config, min(8, asked.episodes), seed)
+    return ReturnReport(directory, learner, env, asked.episodes, asked.video_steps, seed)
 
 
 def size_of(config: WorldModelRunConfig) -> ModelSize:
@@ -286,14 +281,6 @@ def make_run_replay(
         prefetch=2 if config.device != "cpu" and place.device == "cpu" and latents is None else None,
         **windows,
     )
-
-
-def make_run_evaluator(config: RunConfig, directory: Path, learner: Learner) -> Evaluator:
-    """Make the evaluator used during training; processes other than the first get one that does nothing."""
-    if not parallel.is_first():
-        return NoReport()
-    asked = config.evaluation
-    return make_evaluator(config, directory, learner, asked.episodes, asked.video_steps, asked.start_noise)
 
 
 def make_tracker(config: RunConfig) -> EpisodeTracker:

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any, ClassVar
 
 from hydra.core.config_store import ConfigStore
-from omegaconf import MISSING
+from omegaconf import MISSING, DictConfig
 
 from dreamer_racing import parallel
 from dreamer_racing.envs.config import EnvConfig
@@ -238,10 +238,7 @@ class WorldModelRunConfig(ReplayRunConfig):
         """Refuse worker settings without collector=ray, several learners with it, and unequal shares of the worlds."""
         workers, num_envs, asked = self.num_workers, self.env.num_envs, self.workers
         if self.collector is not CollectorKind.ray:
-            default = vars(WorkersConfig())
-            given = [] if workers is None else [f"num_workers={workers}"]
-            given += [f"workers.{name}={value}" for name, value in vars(asked).items() if value != default[name]]
-            if given:
+            if given := worker_settings(self):
                 raise ValueError(f"{given[0]} is for collector=ray: add that, or leave it out.")
             return
         assert workers is not None, "resolve_workers() sets it"
@@ -349,6 +346,13 @@ RECIPES: dict[str, type[RunConfig]] = {
     schema.algorithm: schema for schema in (DreamerV3RunConfig, LatentPPORunConfig, PPORunConfig, SACRunConfig)
 }
 """Configuration classes by algorithm, which is also the name of its file in recipes/ and recipes/config/."""
+
+
+def worker_settings(config: WorldModelRunConfig | DictConfig) -> list[str]:
+    """Return the settings of workers that differ from their defaults, as NAME=VALUE."""
+    chosen = {name: (getattr(config.workers, name), default) for name, default in vars(WorkersConfig()).items()}
+    given = [] if config.num_workers is None else [f"num_workers={config.num_workers}"]
+    return given + [f"workers.{name}={value}" for name, (value, default) in chosen.items() if value != default]
 
 
 def is_race(config: RunConfig) -> bool:

@@ -11,7 +11,7 @@ from omegaconf import DictConfig, OmegaConf
 from torchrl.envs import TensorDictPrimer, TransformedEnv
 
 from composing.building import Environment, make_agent, make_collector, make_env, worlds_device
-from composing.schema import CollectorKind, LatentPPORunConfig, WorldModelRunConfig, is_race
+from composing.schema import CollectorKind, LatentPPORunConfig, WorldModelRunConfig, is_race, worker_settings
 from dreamer_racing import parallel
 from dreamer_racing.envs.policy_memory import with_memory
 from dreamer_racing.experience import ray_cluster
@@ -81,12 +81,9 @@ def resolve_workers(config: DictConfig) -> None:
     if config.collector is CollectorKind.ray:
         config.num_workers = NUM_WORKERS if config.num_workers is None else config.num_workers
     elif config.resume:
-        default = OmegaConf.structured(ray_cluster.WorkersConfig)
-        left_out = [] if config.num_workers is None else [f"num_workers={config.num_workers}"]
-        left_out += [f"workers.{name}={value}" for name, value in config.workers.items() if value != default[name]]
-        if left_out:
+        if left_out := worker_settings(config):
             print(f"workers: none (collector={config.collector.value}); ignored: {', '.join(left_out)}")
-        config.num_workers, config.workers = None, default
+        config.num_workers, config.workers = None, OmegaConf.structured(ray_cluster.WorkersConfig)
 
 
 def make_own_env(config: WorldModelRunConfig) -> Environment:

@@ -263,7 +263,7 @@ def test_control_rate_line_starts_and_noise_reach_training_and_evaluation(tmp_pa
     assert (env.worlds._starts._on_line, env.worlds.race._sweep._miss_radius) == (0.5, 2)
     learner = recipe_module("composing.building").make_learner(config, Interface.of(env), "cpu")
     env.close()
-    report = arena.make_evaluator(config, tmp_path, learner, 3, 20, config.evaluation.start_noise)
+    report = arena.make_evaluator(config, tmp_path, learner)
     assert report._course.base.worlds.parameters.control_dt == 0.04
     assert report._course.base.worlds.race._sweep._miss_radius == 0
     assert report._course.base.worlds.num_envs == 3, "all begin at once, so that every agent meets the same starts"
