@@ -189,14 +189,7 @@ class SightResults:
 def sight_report(
     title: str, looked: dict[str, SightResults], corrupted: dict[float, list[Result]], provenance: dict[str, Any]
 ) -> str:
-    """Return the tables as a Markdown page.
-
-    Args:
-        title: of the page.
-        looked: results by the name of the kind of flight.
-        corrupted: flights with corrupted images, by the noise of their starts.
-        provenance: where they come from.
-    """
+    """Return the tables as a Markdown page; flights with corrupted images are given by the noise of their starts."""
     parts = [report_heading(title, provenance), "## What the camera points at\n", START_TEXT[START_NOISE]]
     sights = {name: kind.sights for name, kind in looked.items()}
     parts += [sight_table(sights), "Share of time in view, gate by gate:\n", gate_table(sights)]

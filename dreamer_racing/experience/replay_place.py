@@ -51,13 +51,9 @@ class ReplayPlace(NamedTuple):
 
 
 def choose_place(config: ReplayConfig, size: int, learner: str, folder: Path) -> ReplayPlace:
-    """Choose where to store a replay of ``size`` bytes.
+    """Choose where to store a replay of ``size`` bytes: files go to ``folder``.
 
-    Args:
-        config: The settings; ``device=auto`` is the learner's device, if the replay takes less than half its room.
-        size: Bytes when full.
-        learner: Device of the learner.
-        folder: For files, with ``storage=memmap``.
+    With ``device=auto`` it is the learner's device, if the replay takes less than half its free memory.
     """
     if config.storage is Storage.memmap:
         return ReplayPlace(config.capacity, size, "cpu", folder)

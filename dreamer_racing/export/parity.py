@@ -161,14 +161,7 @@ def check_parity(actors: Mapping[str, RecurrentActor], flight: RecordedFlight, s
 def measure_latencies(
     step: Callable[..., Sequence[Tensor]], flight: RecordedFlight, output: Path, parts: bool
 ) -> Iterator[str]:
-    """Yield lines on how long a step takes with one thread.
-
-    Args:
-        step: An `ActorStep`.
-        flight: Observations for it.
-        output: The exported actor.
-        parts: Whether it was also exported in two parts: then also on the one from image to action.
-    """
+    """Yield lines on how long an `ActorStep` takes, and its export; with ``parts`` also from image to action."""
     contract = read_contract(output.parent / CONTRACT)
     actors = {"onnxruntime": OnnxActor(output, whole=True), "torch": TorchActor(contract, step)}
     imu = {} if flight.imu is None else {"imu": flight.imu[0]}

@@ -56,11 +56,7 @@ def chase_beside_onboard(view: ChaseView, trajectory: Trajectory, gap: int = 8) 
 
 
 def film_from_outside(directory: Path, view: ChaseView, track: Track, trajectory: Trajectory) -> str:
-    """Write a video of the whole flight and a GIF of its second lap, seen from outside and by the drone.
-
-    Returns:
-        The names of the files, in words.
-    """
+    """Write a video of the whole flight and a GIF of its second lap, from outside and by the drone; name the files."""
     frames, words = chase_beside_onboard(view, trajectory), race_words(track, trajectory)
     view.close()
     filmed = write_video(directory / "chase.mp4", caption(frames, words), fps=1 / trajectory.control_dt, scale=1)

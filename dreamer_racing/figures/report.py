@@ -256,11 +256,7 @@ def report_condition(into: RunDirectory, result: Result, video_steps: int) -> No
 
 
 def report_flight(directory: Path, track: Track, result: Evaluation) -> str:
-    """Write the numbers and a plot of a single flight, and if it has images a video and a GIF of its second lap.
-
-    Returns:
-        The names of the files, in words.
-    """
+    """Write numbers and a plot of a flight, of one with images a video and a GIF of its second lap; name the files."""
     trajectory = result.trajectories[0]
     (directory / EVALUATION).write_text(result.to_json())
     stored = write_flight(directory / "flight", trajectory, track)
