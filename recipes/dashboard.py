@@ -81,7 +81,16 @@ def main(config: DashboardConfig) -> None:
         print(line.replace("`", ""))
     print(f"page: {output} ({size / 1e6:.1f} MB, opens in a browser without a server)")
     if config.serve is not None:
-        show(track, flights, config.serve, training)
+        try:
+            serve(
+                track,
+                flights,
+                config.serve,
+                training,
+                lambda address: print(f"live: {address} until Ctrl+C", flush=True),
+            )
+        except KeyboardInterrupt:
+            print("ended")
 
 
 def find(config: DashboardConfig) -> list[Source]:
@@ -143,14 +152,6 @@ def fly(place: str, config: DashboardConfig) -> Source:
     name = restored.checkpoint.name if is_agent(restored.checkpoint) else restored.run_dir.name
     flight = ShownFlight(f"{name}, {restored.env_steps:,} env_steps", flown.trajectories[0])
     return Source(flight, load_track(worlds["track"]), restored.run_dir)
-
-
-def show(track: Track, flights: list[ShownFlight], port: int, training: list[str]) -> None:
-    """Serve until interrupted."""
-    try:
-        serve(track, flights, port, training, lambda address: print(f"live: {address} until Ctrl+C", flush=True))
-    except KeyboardInterrupt:
-        print("ended")
 
 
 if __name__ == "__main__":

@@ -34,39 +34,30 @@ class IdentificationConfig:
 
 @recipe("identification", IdentificationConfig)
 def main(config: IdentificationConfig) -> None:
-    """Read, fit, write."""
+    """Fit a drone to the flight, write it, and print the results."""
     with plain_errors():
-        identify(config)
+        if config.flight is None:
+            raise ValueError("flight= is missing: a folder in which recipes/hil.py flew, or a table.")
+        from dreamer_racing.envs.drone.parameters import load_preset, save_drone
+        from dreamer_racing.identification.fitting import fit
+        from dreamer_racing.identification.recorded import read_recorded
 
-
-def identify(config: IdentificationConfig) -> None:
-    """Fit a drone to the flight, write it, and print the results.
-
-    Raises:
-        ValueError: The flight is missing, too short or too quiet, the preset has no Betaflight, or the fit diverged.
-    """
-    if config.flight is None:
-        raise ValueError("flight= is missing: a folder in which recipes/hil.py flew, or a table.")
-    from dreamer_racing.envs.drone.parameters import load_preset, save_drone
-    from dreamer_racing.identification.fitting import fit
-    from dreamer_racing.identification.recorded import read_recorded
-
-    nominal, recorded = load_preset(config.preset), read_recorded(config.flight)
-    recorded.check(f"flight={config.flight}")
-    logging.getLogger("dreamer_racing.identification").setLevel(logging.INFO)
-    found = fit(recorded, nominal)
-    about = {
-        "flight": Path(config.flight).name,
-        "begun_with": Path(config.preset).name,
-        "error_of_rates": {axis: round(error, 4) for axis, error in found.errors.items()},
-        "not_told": list(found.unknown),
-    }
-    if not all(math.isfinite(error) for error in found.errors.values()):
-        raise ValueError("The fit diverged: start from a preset= closer to the drone.")
-    save_drone(Path(config.output), found.parameters, about)
-    for line in found.lines(config.preset):
-        print(line)
-    print(f"written to {config.output}: env=betaflight env.preset={config.output}")
+        nominal, recorded = load_preset(config.preset), read_recorded(config.flight)
+        recorded.check(f"flight={config.flight}")
+        logging.getLogger("dreamer_racing.identification").setLevel(logging.INFO)
+        found = fit(recorded, nominal)
+        about = {
+            "flight": Path(config.flight).name,
+            "begun_with": Path(config.preset).name,
+            "error_of_rates": {axis: round(error, 4) for axis, error in found.errors.items()},
+            "not_told": list(found.unknown),
+        }
+        if not all(math.isfinite(error) for error in found.errors.values()):
+            raise ValueError("The fit diverged: start from a preset= closer to the drone.")
+        save_drone(Path(config.output), found.parameters, about)
+        for line in found.lines(config.preset):
+            print(line)
+        print(f"written to {config.output}: env=betaflight env.preset={config.output}")
 
 
 if __name__ == "__main__":

@@ -9,6 +9,7 @@ project's choice.
 """
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import torch
@@ -288,16 +289,14 @@ class PilotPolicy(TensorDictModuleBase):
         return tensordict.set("action", action.to(position))
 
 
-def _scripted(track: Track, parameters: QuadrotorParameters) -> TensorDictModuleBase:
-    """Make the pilot that plans a line through the gates and follows it."""
-    return PilotPolicy(ScriptedPilot(track, parameters))
-
-
 def _hover(track: Track, parameters: QuadrotorParameters) -> TensorDictModuleBase:
     """Make the pilot that stays at the start."""
     still = torch.tensor([parameters.hover_action, 0.0, 0.0, 0.0])
     return TensorDictModule(lambda position: still.repeat(len(position), 1), [("privileged", "position")], ["action"])
 
 
-PILOTS = {"scripted": _scripted, "hover": _hover}
+PILOTS: dict[str, Callable[[Track, QuadrotorParameters], TensorDictModuleBase]] = {
+    "scripted": lambda track, parameters: PilotPolicy(ScriptedPilot(track, parameters)),
+    "hover": _hover,
+}
 """Factories of policies that fly by the true state, given the track and the drone's parameters."""
