@@ -82,13 +82,7 @@ def main(config: DashboardConfig) -> None:
     print(f"page: {output} ({size / 1e6:.1f} MB, opens in a browser without a server)")
     if config.serve is not None:
         try:
-            serve(
-                track,
-                flights,
-                config.serve,
-                training,
-                lambda address: print(f"live: {address} until Ctrl+C", flush=True),
-            )
+            serve(track, flights, config.serve, training, lambda live: print(f"live: {live} until Ctrl+C", flush=True))
         except KeyboardInterrupt:
             print("ended")
 
