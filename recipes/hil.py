@@ -172,13 +172,8 @@ def conclude(config: HilConfig, flight: Prepared, ended: str) -> dict[str, Any]:
         "battery": None,
     }
     if (thrust := flight.link.thrust) is not None:
-        readings = {"readings": 0} if chain.battery is None else chain.battery.summary()
-        summary["battery"] = {
-            "voltage_set": config.voltage,
-            "voltage": thrust.voltage,
-            "rejected": flight.link.rejected,
-            **readings,
-        }
+        battery = {"voltage_set": config.voltage, "voltage": thrust.voltage, "rejected": flight.link.rejected}
+        summary["battery"] = battery | ({"readings": 0} if chain.battery is None else chain.battery.summary())
     if config.record:
         (flight.folder / STATISTICS).write_text(json.dumps(summary, indent=2) + "\n", encoding="utf-8")
     return summary
