@@ -88,6 +88,33 @@ def is_first() -> bool:
     return _here.rank == 0
 
 
+def check_devices(devices: Mapping[str, str]) -> None:
+    """Refuse more processes than this machine has CUDA devices, and the same device for all of them.
+
+    Args:
+        devices: Devices by the names of their settings, which the message gives.
+    """
+    here, there = num_local_processes(), torch.cuda.device_count()
+    for name, device in devices.items():
+        if not device.startswith("cuda"):
+            continue
+        if ":" in device:
+            raise ValueError(
+                f"{name}={device} would put all {num_processes()} processes on one device: with {name}=cuda each gets "
+                "its own; CUDA_VISIBLE_DEVICES selects them."
+            )
+        if here > there:
+            raise ValueError(
+                f"{name}={device} needs a CUDA device for each of the {here} processes on this machine, which has "
+                f"{there}: start torchrun with --nproc-per-node={max(there, 1)}, or set {name}=cpu."
+            )
+
+
+def own_device(device: str) -> str:
+    """Return this process's own device of the given type."""
+    return f"cuda:{os.environ['LOCAL_RANK']}" if device.startswith("cuda") else device
+
+
 def average_(values: Iterable[Tensor]) -> None:
     """Replace tensors of one device by their mean over the processes, in a single all-reduce."""
     tensors = list(values)

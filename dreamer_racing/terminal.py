@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import codecs
 import io
+import logging
 import os
 import stat
 import sys
 from contextlib import suppress
+from pathlib import Path
 
 PLAINER = {
     "–": "-", "−": "-", "→": "->", "←": "<-", "…": "...", "×": "x", "≤": "<=", "≥": ">=", "≈": "~", "±": "+-",
@@ -26,6 +28,20 @@ def take_any_terminal() -> None:
         if isinstance(stream, io.TextIOWrapper):
             with suppress(OSError):  # raised by streams that are also readable and cannot seek
                 stream.reconfigure(errors="plainer")
+
+
+def start_logging() -> None:
+    """Print the package's log messages on stdout, one line each."""
+    logging.basicConfig(level=logging.WARNING, format="%(message)s", stream=sys.stdout, force=True)
+    logging.getLogger("dreamer_racing").setLevel(logging.INFO)
+    logging.getLogger("torchrl").setLevel(logging.WARNING)
+
+
+def follow_quietly() -> None:
+    """Print nothing but warnings and errors, on stderr, in a process other than the first, which prints the rest."""
+    sys.stdout = Path(os.devnull).open("w", encoding="utf-8")  # noqa: SIM115 - until the process ends
+    logging.basicConfig(level=logging.WARNING, format="%(message)s", stream=sys.stderr, force=True)
+    logging.getLogger("dreamer_racing").setLevel(logging.WARNING)
 
 
 def say(text: str) -> None:

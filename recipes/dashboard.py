@@ -12,7 +12,6 @@ recipes/fly.py, or a file *_trajectory.csv; or an included agent by its name, wh
 TensorBoard: the page says how to open it.
 """
 
-import shlex
 from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple
@@ -29,16 +28,13 @@ from dreamer_racing.export.agents import existing_agent_path
 from dreamer_racing.export.shipped_agent import is_agent
 from dreamer_racing.figures.dashboard import write_page
 from dreamer_racing.figures.dashboard_live import serve
-from dreamer_racing.figures.dashboard_panel import ShownFlight, missing
-from dreamer_racing.figures.evaluations import evaluation_files
+from dreamer_racing.figures.dashboard_panel import ShownFlight, how_it_trained, missing
+from dreamer_racing.figures.evaluations import STORED, stored_flights
 from dreamer_racing.figures.plotting import run_of, stage_name
 from dreamer_racing.figures.scene_3d import check_viser
 from dreamer_racing.settings import SEED, Range, setting
-from dreamer_racing.training.directory import RunDirectory
 
 PAGE = "dashboard.html"
-STORED = ("flight", "deterministic")
-"""Prefixes of the files in which recipes/fly.py and recipes/evaluate.py store flights."""
 
 
 @dataclass
@@ -77,7 +73,7 @@ def main(config: DashboardConfig) -> None:
     with plain_errors():
         check_viser()
         sources = find(config)
-        training = [how_it_trained(sources)]
+        training = [how_it_trained(source.folder for source in sources)]
         flights, track = [source.flight for source in sources], sources[0].track
         output = Path(config.output or Path(from_here(sources[0].folder)) / PAGE)
         size = write_page(output, track, flights, training)
@@ -85,7 +81,10 @@ def main(config: DashboardConfig) -> None:
         print(line.replace("`", ""))
     print(f"page: {output} ({size / 1e6:.1f} MB, opens in a browser without a server)")
     if config.serve is not None:
-        show(track, flights, config.serve, training)
+        try:
+            serve(track, flights, config.serve, training, lambda live: print(f"live: {live} until Ctrl+C", flush=True))
+        except KeyboardInterrupt:
+            print("ended")
 
 
 def find(config: DashboardConfig) -> list[Source]:
@@ -129,14 +128,6 @@ def locate(setting_name: str, place: str) -> Path | str:
     return flights[-1]
 
 
-def stored_flights(folder: Path) -> list[Path]:
-    """Return the files of a run's evaluation flights, the latest last; or those in a recipe's output folder."""
-    if evaluated := evaluation_files(folder, NUMBERS):
-        return evaluated
-    places = (folder, RunDirectory(folder).evaluations)
-    return [file for place in places for name in STORED if (file := place / f"{name}{NUMBERS}").is_file()]
-
-
 def read(file: Path) -> Source:
     """Read a stored flight with its track; its title names run and evaluation."""
     trajectory, track = read_flight(file)
@@ -155,26 +146,6 @@ def fly(place: str, config: DashboardConfig) -> Source:
     name = restored.checkpoint.name if is_agent(restored.checkpoint) else restored.run_dir.name
     flight = ShownFlight(f"{name}, {restored.env_steps:,} env_steps", flown.trajectories[0])
     return Source(flight, load_track(worlds["track"]), restored.run_dir)
-
-
-def how_it_trained(sources: list[Source]) -> str:
-    """Return a line on how to open the training curves in TensorBoard."""
-    # Relative to the working directory if possible, because pages are shown to others.
-    logged = {Path(from_here(source.folder)): None for source in sources if (source.folder / "tensorboard").is_dir()}
-    if not logged:
-        return "Training curves: none, because these flights are in no run directory with TensorBoard files."
-    if len(logged) == 1:
-        return f"Training curves: `tensorboard --logdir {shlex.quote(str(*logged))}`"
-    runs = ",".join(f"{folder.name}:{folder}" for folder in logged)
-    return f"Training curves: `tensorboard --logdir_spec {shlex.quote(runs)}`"
-
-
-def show(track: Track, flights: list[ShownFlight], port: int, training: list[str]) -> None:
-    """Serve until interrupted."""
-    try:
-        serve(track, flights, port, training, lambda address: print(f"live: {address} until Ctrl+C", flush=True))
-    except KeyboardInterrupt:
-        print("ended")
 
 
 if __name__ == "__main__":

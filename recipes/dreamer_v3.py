@@ -20,6 +20,7 @@ from composing.workers import make_own_env, make_rollouts, share_of
 from omegaconf import DictConfig
 
 from dreamer_racing.envs import DroneRacingEnv
+from dreamer_racing.evaluation.held_out import measure
 from dreamer_racing.learners.dreamer_v3 import DreamerV3
 from dreamer_racing.modules import Interface
 from dreamer_racing.training.schedule import Schedule
@@ -50,7 +51,7 @@ def train(config: DreamerV3RunConfig, session: Session) -> None:
         learner=learner,
         env=env,
         rollouts=rollouts,
-        evaluator=building.make_run_evaluator(config, session.directory.path, learner),
+        evaluator=building.make_evaluator(config, session.directory.path, learner),
         tracker=building.make_tracker(config),
         replay=replay,
         ratio=ratio,
@@ -85,7 +86,7 @@ def train(config: DreamerV3RunConfig, session: Session) -> None:
         if session.due("evaluate"):
             session.evaluate()
         if session.due("log"):
-            session.write_row(building.measure(session, learner, replay, scheduled))
+            session.write_row(measure(session, learner, replay, scheduled))
         session.save_if_due()
 
 

@@ -12,29 +12,17 @@ docs/evaluation.md, with both presets of physics, and adds evaluation.md. An ear
 import json
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, cast
+from typing import Any
 
-from composing.building import make_evaluator, shared_env_arguments
+from composing.building import shared_env_arguments
 from composing.entry import plain_disk_errors, plain_errors, recipe
-from composing.restoring import FlightConfig, Restored, report_heading, restore
+from composing.restoring import FlightConfig, Restored, restore
 
 from dreamer_racing.envs.race.starts import StartSampler
 from dreamer_racing.envs.tracks import Track
-from dreamer_racing.evaluation.protocol import (
-    CONDITIONS,
-    EPISODES,
-    MODES,
-    PRESETS,
-    Result,
-    check_conditions,
-    results_table,
-    run_protocol,
-)
-from dreamer_racing.figures.film import onboard_beside_map, write_video
-from dreamer_racing.figures.hud import caption, race_words
-from dreamer_racing.figures.protocol import plot_conditions, plot_crashes
-from dreamer_racing.figures.report import EvaluationReport
-from dreamer_racing.figures.top_down import plot_top_down
+from dreamer_racing.evaluation.protocol import CONDITIONS, EPISODES, MODES, Result, check_conditions, run_protocol
+from dreamer_racing.figures.protocol import write_markdown
+from dreamer_racing.figures.report import EvaluationReport, report_condition
 from dreamer_racing.settings import COUNT, NOT_NEGATIVE, SEED, check_choice, setting
 from dreamer_racing.terminal import say
 from dreamer_racing.training.directory import EVALUATION, RunDirectory, fresh_directory, replace_text
@@ -70,7 +58,12 @@ def main(config: EvaluateConfig) -> None:
         refuse_races(config, restored.trained.saved_track())
         directory = fresh_directory(config.run_dir or RunDirectory(restored.run_dir).evaluation, EVALUATION)
         print(f"race: {restored.trained.track}, {restored.trained.env.preset}, {config.episodes} episodes")
-        report = make_nominal_report(config, restored, directory) if config.protocol == "nominal" else None
+        report = None
+        if config.protocol == "nominal":
+            worlds = {**shared_env_arguments(restored.trained), "start_noise": config.start_noise}
+            report = EvaluationReport(
+                directory, restored.flyer, worlds, config.episodes, config.video_steps, config.num_envs, config.seed
+            )
     with plain_disk_errors():
         if report:
             written = evaluate_nominal(report)
@@ -91,21 +84,6 @@ def refuse_races(config: EvaluateConfig, track: Track) -> None:
         check_conditions(CONDITIONS, track, config.seed)
     else:
         StartSampler(track, start_noise=config.start_noise)
-
-
-def make_nominal_report(config: EvaluateConfig, restored: Restored, directory: Path) -> EvaluationReport:
-    """Make the evaluation in the race that the policy was restored for."""
-    report = make_evaluator(
-        restored.trained,
-        directory,
-        restored.flyer,
-        config.episodes,
-        config.video_steps,
-        config.start_noise,
-        num_envs=config.num_envs,
-        seed=config.seed,
-    )
-    return cast(EvaluationReport, report)
 
 
 def evaluate_nominal(report: EvaluationReport) -> dict[str, Any]:
@@ -131,40 +109,17 @@ def evaluate_fully(config: EvaluateConfig, restored: Restored, directory: Path) 
         results.append(result)
         say(f"\n{result.preset}, {result.condition}, {result.mode} policy\n{result.evaluation.summary()}")
         if result.preset == trained.env.preset:
-            write_flight(directory, result, config.video_steps)
+            report_condition(RunDirectory(directory), result, config.video_steps)
         path = RunDirectory(directory).evaluations / f"{result.name}.json"
         path.parent.mkdir(exist_ok=True)
         path.write_text(result.evaluation.to_json())
     return results
 
 
-def write_flight(directory: Path, result: Result, video_steps: int) -> None:
-    """Plot the first flight of a condition from above; film it, if it has images and the policy is deterministic."""
-    trajectory = result.evaluation.trajectories[0]
-    plot_top_down(result.track, trajectory, RunDirectory(directory).plots / f"{result.name}.png")
-    if trajectory.pixels is not None and result.mode == "deterministic":
-        frames = onboard_beside_map(result.track, trajectory.part(0, min(video_steps, len(trajectory.action))))
-        film = caption(frames, race_words(result.track, trajectory)[: len(frames)])
-        write_video(RunDirectory(directory).videos / f"{result.name}.mp4", film, fps=round(1 / trajectory.control_dt))
-
-
 def describe(results: list[Result], preset: str) -> dict[str, Any]:
     """Return the contents of evaluation.json: the nominal race as with protocol=nominal, and all conditions."""
     nominal = {r.mode: r.evaluation.to_dict() for r in results if r.preset == preset and r.condition == "nominal"}
     return {**nominal, "conditions": [result.to_dict() for result in results]}
-
-
-def write_markdown(directory: Path, results: list[Result], provenance: dict[str, Any]) -> None:
-    """Write the table of conditions with its two plots."""
-    title = f"{provenance['algorithm']} on {provenance['track']}, {provenance['env_steps']:,} env_steps"
-    plot_conditions(results, RunDirectory(directory).plots / "conditions.png", title)
-    for preset in dict.fromkeys(result.preset for result in results):
-        flown = {r.mode: r.evaluation for r in results if r.preset == preset and r.condition == "nominal"}
-        plot_crashes(flown, RunDirectory(directory).plots / f"crashes_{preset}.png", f"{title}, nominal, {preset}")
-    meanings = "\n".join(f"- `{condition.name}`: {condition.meaning}" for condition in CONDITIONS)
-    plots = "\n\n".join(f"![{name}](plots/{name}.png)" for name in ("conditions", *(f"crashes_{p}" for p in PRESETS)))
-    text = f"{report_heading(title, provenance)}\n{results_table(results)}\n{meanings}\n\n{plots}\n"
-    (directory / "evaluation.md").write_text(text, encoding="utf-8")
 
 
 if __name__ == "__main__":

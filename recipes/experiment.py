@@ -10,10 +10,7 @@ command continues an experiment that was interrupted: finished runs are skipped,
 """
 
 import os
-import signal
-import subprocess
 import sys
-import threading
 from collections.abc import Iterable
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -32,10 +29,10 @@ from yaml import YAMLError, safe_load
 
 from dreamer_racing.settings import check_choice, shortened
 from dreamer_racing.training.directory import RunDirectory, latest_checkpoint
+from dreamer_racing.training.signals import run_passing_signals
 
 FOLDER = Path(__file__).resolve().parent
 LOG = "log.txt"
-SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGUSR1, signal.SIGUSR2)
 EXPERIMENT_SETTINGS = ("name", "algorithm", "variant", "variants", "overrides", "directory")  # not for recipes
 
 # Launchers start processes that must find the modules of this folder.
@@ -75,12 +72,6 @@ def main(settings: ExperimentConfig) -> None:
         note.write_text(f"{error}\n", encoding="utf-8")
 
 
-def check(config: ExperimentConfig) -> None:
-    """Refuse an unknown algorithm or variant."""
-    for name, known in (("algorithm", tuple(RECIPES)), ("variant", tuple(config.variants))):
-        check_choice(name, getattr(config, name), known)
-
-
 def directory_of(config: ExperimentConfig) -> Path:
     """Return the directory of one run."""
     name = f"{config.algorithm}_{Path(config.track).stem}_{config.variant}_seed{config.seed}"
@@ -101,8 +92,8 @@ def complete_run(config: ExperimentConfig, run_dir: Path, given: list[str]) -> N
     RunDirectory(run_dir).claim().release()  # refuses a live run here, rather than in its log
     began = "resumed" if any("resume=" in word for word in command) else "started"
     print(f"{run_dir}: {began}, budget={config.budget}", flush=True)
-    if status := run(command, run_dir):
-        log = run_dir / LOG
+    log = run_dir / LOG
+    if status := run_passing_signals(command, log):
         last = "\n".join(log.read_text(errors="replace").replace("\r", "\n").splitlines()[-5:])
         raise RuntimeError(f"{config.algorithm} ended with status {status}; {log} ends with:\n{last}")
     print(f"{run_dir}: {'done' if next_command(config, given) is None else 'interrupted'}", flush=True)
@@ -118,7 +109,8 @@ def next_command(config: ExperimentConfig, given: list[str]) -> list[str] | None
     Raises:
         ValueError: the algorithm or the variant is unknown, or the directory holds a run with other settings.
     """
-    check(config)
+    for name, known in (("algorithm", tuple(RECIPES)), ("variant", tuple(config.variants))):
+        check_choice(name, getattr(config, name), known)
     run_dir = directory_of(config)
     chosen = [f"track={config.track}", f"seed={config.seed}", f"budget={config.budget}", *config.overrides]
     of_recipe = [override for override in given if override_key(override).partition(".")[0] not in EXPERIMENT_SETTINGS]
@@ -130,25 +122,17 @@ def next_command(config: ExperimentConfig, given: list[str]) -> list[str] | None
         latest_checkpoint(RunDirectory(run_dir).checkpoints)
     except FileNotFoundError:
         return [*recipe, as_override("run_dir", run_dir), *overrides]
-    refuse_other_settings(run_dir, overrides)
-    if tuned := tuned_by_recipe(run_dir, overrides):
-        wanted = cast(RunConfig, compose(config.algorithm, [*overrides, tuned]))
+    saved, given_now = settings_of(read_yaml(RunDirectory(run_dir).overrides, ListConfig)), settings_of(overrides)
+    refuse_other_settings(run_dir, saved, given_now)
+    if "tuned" in saved and "tuned" not in given_now:  # chosen for tuned=auto; it changes the run's length
+        wanted = cast(RunConfig, compose(config.algorithm, [*overrides, f"tuned={saved['tuned']}"]))
     if RunDirectory(run_dir).finished_env_steps() >= wanted.total_env_steps:
         return None
     return [*recipe, as_override("resume", run_dir), f"total_env_steps={wanted.total_env_steps}"]
 
 
-def tuned_by_recipe(run_dir: Path, overrides: list[str]) -> str | None:
-    """Return the override that the run's recipe chose for tuned=auto, because it changes the run's length."""
-    if "tuned" in settings_of(overrides):
-        return None
-    saved = settings_of(read_yaml(RunDirectory(run_dir).overrides, ListConfig))
-    return f"tuned={saved['tuned']}" if "tuned" in saved else None
-
-
-def refuse_other_settings(run_dir: Path, overrides: list[str]) -> None:
+def refuse_other_settings(run_dir: Path, saved: dict[str, Any], wanted: dict[str, Any]) -> None:
     """Refuse to resume a run that was started with other overrides, except for its length."""
-    saved, wanted = settings_of(read_yaml(RunDirectory(run_dir).overrides, ListConfig)), settings_of(overrides)
     saved = {name: value for name, value in saved.items() if name != "tuned" or name in wanted}  # chosen by tuned=auto
     differing = [name for name in sorted(saved.keys() | wanted.keys()) if saved.get(name) != wanted.get(name)]
     if differing:
@@ -176,40 +160,6 @@ def settings_of(overrides: Iterable[str]) -> dict[str, Any]:
         except YAMLError as error:
             raise ValueError(f"The override {shortened(override)} has no value that can be read.") from error
     return values
-
-
-def run(command: list[str], run_dir: Path) -> int:
-    """Run a recipe in a process of its own, with its output in a file; return its exit status.
-
-    Signals are passed on as SIGTERM, so that the recipe saves and ends. Then this process ends too, or calls the
-    handler that the signal had before: that of a Slurm job queues the job again.
-    """
-    received: list[signal.Signals] = []
-    here = threading.current_thread()  # only the main thread may set handlers
-    before = {number: signal.getsignal(number) for number in SIGNALS} if here is threading.main_thread() else {}
-    if before.get(signal.SIGHUP) is signal.SIG_IGN:  # nohup
-        del before[signal.SIGHUP]
-    for number in before.keys() & {signal.SIGUSR1, signal.SIGUSR2}:
-        signal.signal(number, signal.SIG_IGN)  # inherited by the recipe, since Slurm signals every process
-    log = (run_dir / LOG).open("a", encoding="utf-8")
-    with log, subprocess.Popen(command, stdout=log, stderr=log, start_new_session=True) as process:
-
-        def pass_on(number: int, frame: object) -> None:
-            received.append(signal.Signals(number))
-            process.send_signal(signal.SIGTERM)
-
-        for number in before:
-            signal.signal(number, pass_on)
-        status = process.wait()
-    for number, handler in before.items():
-        signal.signal(number, handler)
-    if received:
-        print(f"{run_dir}: interrupted by {received[0].name}", flush=True)
-        handler = before[received[0]]
-        if received[0] in (signal.SIGUSR1, signal.SIGUSR2) and callable(handler):
-            handler(received[0], None)
-        raise SystemExit(128 + received[0])
-    return status
 
 
 if __name__ == "__main__":

@@ -17,14 +17,12 @@ import sys
 import warnings
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
-from functools import partial
 from pathlib import Path
 from typing import Any
 
 from composing.building import serialize_track_file, shared_env_arguments
 from composing.entry import as_override, override_key, override_value, plain_errors, recipe
 from composing.options import command
-from composing.restoring import config_folder, find_trained, results_of
 from composing.saved import trained_config
 from composing.schema import WorldModelRunConfig, is_race
 from omegaconf import MISSING, OmegaConf
@@ -33,7 +31,6 @@ from torch import set_num_threads
 from dreamer_racing.envs.imu import load_imu
 from dreamer_racing.envs.torchrl_env import DroneRacingEnv
 from dreamer_racing.envs.tracks import BUILTIN_TRACKS, Track, describe_track, hash_track, load_track
-from dreamer_racing.evaluation.protocol import MODES
 from dreamer_racing.export.actor_step import (
     LATENTS,
     ActorStep,
@@ -42,23 +39,27 @@ from dreamer_racing.export.actor_step import (
     export_actor,
     make_step,
 )
-from dreamer_racing.export.contract import hash_weights, make_contract
-from dreamer_racing.export.onnx_actor import CONTRACT, OnnxActor, measure_latency, read_contract
-from dreamer_racing.export.parity import ParityError, RecordedFlight, TorchActor, episode_steps, record_flight
+from dreamer_racing.export.contract import make_contract
+from dreamer_racing.export.onnx_actor import CONTRACT, read_contract
+from dreamer_racing.export.parity import ParityError, RecordedFlight, episode_steps, measure_latencies, record_flight
 from dreamer_racing.export.shipped_agent import (
     ACTOR,
     AGENT,
     CONFIG,
     ShippedAgent,
     choose_weights,
+    config_folder,
+    find_trained,
     is_agent,
     load_agent,
+    newest_evaluation,
+    read_evaluation,
+    results_of,
 )
 from dreamer_racing.modules import Interface
 from dreamer_racing.settings import COUNT, SEED, check_choice, setting
 from dreamer_racing.training.directory import RunDirectory
 
-BY_ITEM = ("episodes", "crashes_by_gate")  # entries of an evaluation that agent.json leaves out
 MACHINE_SETTINGS = ("run_dir", "resume", "device", "env.device")  # settings that do not affect what is learned
 
 
@@ -118,7 +119,7 @@ def export(config: ExportConfig) -> None:
         raise ValueError(f"output={config.output}: {output.parent} holds an agent, which is kept: choose another.")
     print(f"checkpoint: {checkpoint}")
     step, contract, flight = prepare(config, trained, checkpoint)
-    about = describe(config, trained, checkpoint, step, contract) if config.agent else None
+    about = describe(config, trained, checkpoint, contract) if config.agent else None
     deviation = export_actor(step, contract, flight, output, config.seed, about is not None, config.parts)
     print(f"replayed: {len(flight.actions)} steps, {flight.episodes} episodes, latents equal")
     for name, value in deviation.items():
@@ -127,7 +128,8 @@ def export(config: ExportConfig) -> None:
     if about:
         write_agent(output.parent, trained, about)
         names += [CONFIG, AGENT]
-    measure(step, flight, output, config.parts)
+    for line in measure_latencies(step, flight, output, config.parts):
+        print(line)
     size = sum((output.parent / name).stat().st_size for name in names)
     print(f"written to {output.parent}: {', '.join(names)} ({size / 1e6:.2f} MB)")
 
@@ -193,7 +195,7 @@ def check_agent(config: ExportConfig, checkpoint: Path) -> None:
 
 
 def describe(
-    config: ExportConfig, trained: WorldModelRunConfig, checkpoint: Path, step: ActorStep, contract: dict[str, Any]
+    config: ExportConfig, trained: WorldModelRunConfig, checkpoint: Path, contract: dict[str, Any]
 ) -> dict[str, Any]:
     """Return the contents of agent.json: where the agent comes from, and how well it flies."""
     source = contract["source"]
@@ -205,6 +207,9 @@ def describe(
     training = {"command": trains, "commit": commit, "seed": trained.seed}
     if len(history) > 1:  # resumed, perhaps with other settings
         training["starts"] = history
+    weights, track = contract["weights_sha256"], source["track_sha256"]
+    evaluation = Path(config.evaluation or newest_evaluation(results_of(checkpoint), weights, track))
+    how = f"Make it with: {command('evaluate')} checkpoint={shlex.quote(config.checkpoint)} episodes=100"
     return {
         "algorithm": trained.algorithm,
         "track": Path(trained.track).name,
@@ -214,7 +219,7 @@ def describe(
         "env_steps": source["env_steps"],
         "weights": source["weights"],
         "training": training,
-        "evaluation": read_evaluation(config, trained, checkpoint, hash_weights(step)),
+        "evaluation": read_evaluation(evaluation, checkpoint, weights, trained.track, track, how),
     }
 
 
@@ -234,75 +239,15 @@ def without_machine(overrides: Iterable[str]) -> list[str]:
     return [as_override("track", files[text]) if text in files else text for text in kept]
 
 
-def read_evaluation(
-    config: ExportConfig, trained: WorldModelRunConfig, checkpoint: Path, weights_sha256: str
-) -> dict[str, Any]:
-    """Return the statistics of an evaluation of these weights on the track that they were trained on.
-
-    Raises:
-        FileNotFoundError: there is none.
-        ValueError: it is of other weights or another track, or no evaluation; the message says how to make one.
-    """
-    track_sha256 = hash_track(trained.saved_track())
-    path = Path(config.evaluation or newest_evaluation(results_of(checkpoint), weights_sha256, track_sha256))
-    how = f"Make it with: {command('evaluate')} checkpoint={shlex.quote(config.checkpoint)} episodes=100"
-    if not path.is_file():
-        raise FileNotFoundError(f"There is no evaluation {path}: an agent ships with its results. {how}")
-    try:
-        written = json.loads(path.read_text(encoding="utf-8"))
-        made = written["provenance"]
-    except (ValueError, KeyError, TypeError) as error:
-        raise ValueError(f"{path} is not an evaluation by recipes/evaluate.py ({error!r}). {how}") from error
-    if made.get("weights_sha256") != weights_sha256:
-        raise ValueError(f"{path} is an evaluation of other weights than those of {checkpoint}. {how}")
-    if made.get("track_sha256") is None:
-        raise ValueError(f"{path} does not say which track it was flown on. {how}")
-    if made["track_sha256"] != track_sha256:
-        there = "another track, or with other decoys" if made["track"] == trained.track else made["track"]
-        raise ValueError(f"{path} was flown on {there}, and the agent was trained on {trained.track}. {how}")
-    names = ("episodes", "seed", "start_noise", "preset", "decoys", "date", "commit")
-    statistics = {mode: {name: value for name, value in written[mode].items() if name not in BY_ITEM} for mode in MODES}
-    return {**{name: made[name] for name in names}, **statistics}
-
-
-def newest_evaluation(folder: Path, weights_sha256: str, track_sha256: str) -> Path:
-    """Return a run's latest evaluation of these weights on this track; without one, a file that the caller refuses.
-
-    Each evaluation has a folder of its own.
-    """
-    first = RunDirectory(folder).evaluation_file
-    there = first.parent.parent.glob(f"{first.parent.name}*/{first.name}")
-    texts = {path: path.read_text(encoding="utf-8") for path in there}
-    of_these = [path for path, text in texts.items() if f'"weights_sha256": "{weights_sha256}"' in text]
-    fitting = [path for path in of_these if f'"track_sha256": "{track_sha256}"' in texts[path]]
-    return max(fitting or of_these, key=lambda path: path.stat().st_mtime, default=first)
-
-
 def write_agent(folder: Path, trained: WorldModelRunConfig, about: dict[str, Any]) -> None:
     """Write the configuration, and last agent.json, which makes the folder an agent."""
     (folder / AGENT).unlink(missing_ok=True)
     if trained.env.reward is not None:
         print(f"reward: the agent ships without env.reward={trained.env.reward}; its evaluations use Eq. 1")
-    env, track = (
-        replace(trained.env, device="cpu", reward=None),
-        Path(trained.track).name,
-    )  # without folders of this machine
+    env, track = replace(trained.env, device="cpu", reward=None), Path(trained.track).name  # no folders of this machine
     ships = replace(trained, track=track, run_dir=None, resume=None, device="auto", env=env)
     OmegaConf.save(OmegaConf.structured(ships), folder / CONFIG)
     (folder / AGENT).write_text(json.dumps(about, indent=2, allow_nan=False) + "\n", encoding="utf-8")
-
-
-def measure(step: ActorStep, flight: RecordedFlight, output: Path, parts: bool) -> None:
-    """Print how long one step takes with one thread."""
-    contract = read_contract(output.parent / CONTRACT)
-    actors = {"onnxruntime": OnnxActor(output, whole=True), "torch": TorchActor(contract, step)}
-    imu = {} if flight.imu is None else {"imu": flight.imu[0]}
-    for name, actor in actors.items():
-        print(f"one step, 1 thread, {name}: {measure_latency(partial(actor.step, **imu), flight.observations)}")
-    if parts:
-        actor = OnnxActor(output)
-        latency = measure_latency(partial(actor.step, **imu), flight.observations, actor.prepare)
-        print(f"of this, from image to action: {latency}")
 
 
 if __name__ == "__main__":

@@ -23,42 +23,29 @@ from pathlib import Path
 from typing import Any
 
 import composing  # noqa: F401 - first: explains how to run this if packages are missing
-import numpy as np
 from composing.building import shared_env_arguments
 from composing.entry import plain_errors, recipe
 from composing.restoring import FlightConfig, restore
-from tensordict import TensorDictBase
-from tensordict.nn import TensorDictModule
-from torch import set_num_threads, tensor
+from torch import set_num_threads
 
-from dreamer_racing.envs.drone.parameters import QuadrotorParameters
-from dreamer_racing.envs.race.pilot import PilotPolicy, ScriptedPilot
+from dreamer_racing.envs.race.pilot import PILOTS
 from dreamer_racing.envs.simulator.chase import ChaseView
 from dreamer_racing.envs.simulator.scene import Camera
 from dreamer_racing.envs.torchrl_env import DroneRacingEnv
-from dreamer_racing.envs.tracks import Track, load_track
+from dreamer_racing.envs.tracks import load_track
 from dreamer_racing.envs.viewer import RaceWindow, ViewerUnavailableError, WindowClosedError, check_window
 from dreamer_racing.evaluation.by_hand import KINDS, FlightAbandonedError, HandPolicy, PygameSticks, check_by_hand
 from dreamer_racing.evaluation.course import Course
-from dreamer_racing.evaluation.evaluate import Episode, Evaluation, Trajectory, evaluate
-from dreamer_racing.evaluation.trajectory import write_flight
-from dreamer_racing.figures.chase import chase_beside_onboard
-from dreamer_racing.figures.film import enlarge_to_watch, onboard_beside_map, write_gif, write_video
-from dreamer_racing.figures.hud import caption, laps_completed, race_words
-from dreamer_racing.figures.top_down import plot_top_down
+from dreamer_racing.evaluation.evaluate import Episode, Evaluation, evaluate
+from dreamer_racing.figures.chase import film_from_outside
+from dreamer_racing.figures.film import GIF_SIZE
+from dreamer_racing.figures.report import report_flight
 from dreamer_racing.settings import COUNT, SEED, check_choice, setting
 from dreamer_racing.terminal import say
-from dreamer_racing.training.directory import EVALUATION
 
-GIF_SIZE = 256  # pixels, least side of either picture
-GIF_STRIDE = 2  # control steps a frame: 25 frames a second
-CHASE_STRIDE, CHASE_COLORS = 3, 32  # of chase.gif, in which the whole picture moves
 PILOT, TRACK, PRESET = "scripted", "kidney", "easy"  # defaults without an agent
 VIEWS = ("map", "chase")
-GIF_STEPS = 300  # control steps shown if there is no second lap
 BREAK = 1.0  # s between two flights in the viewer
-
-Acting = Callable[[TensorDictBase], TensorDictBase]
 
 
 @dataclass
@@ -99,21 +86,11 @@ class FlyConfig:
         if self.viewer and self.view == "chase":
             raise ValueError("viewer=true and view=chase, which films the flight: give one of them.")
         if self.viewer:
-            check_display(self)
-
-
-def scripted(track: Track, parameters: QuadrotorParameters) -> Acting:
-    """Make the pilot that plans a line through the gates and follows it."""
-    return PilotPolicy(ScriptedPilot(track, parameters))
-
-
-def hover(track: Track, parameters: QuadrotorParameters) -> Acting:
-    """Make the pilot that stays at the start."""
-    still = tensor([parameters.hover_action, 0.0, 0.0, 0.0])
-    return TensorDictModule(lambda position: still.repeat(len(position), 1), [("privileged", "position")], ["action"])
-
-
-PILOTS: dict[str, Callable[[Track, QuadrotorParameters], Acting]] = {"scripted": scripted, "hover": hover}
+            try:
+                check_window()
+            except ViewerUnavailableError as error:
+                instead = f"leave out viewer=true for a video, a GIF and a plot in {self.run_dir}"
+                raise ValueError(f"{error}; {instead}.") from error
 
 
 @recipe("fly", FlyConfig)
@@ -124,20 +101,6 @@ def main(config: FlyConfig) -> None:
         watch(config)
     else:
         fly(config)
-
-
-def check_display(config: FlyConfig) -> None:
-    """Refuse viewer=true if no window can be opened, and name the alternative.
-
-    Raises:
-        ValueError: no window can be opened here.
-    """
-    try:
-        check_window()
-    except ViewerUnavailableError as error:
-        raise ValueError(
-            f"{error}; leave out viewer=true for a video, a GIF and a plot in {config.run_dir}."
-        ) from error
 
 
 @dataclass
@@ -162,9 +125,10 @@ def fly(config: FlyConfig) -> None:
         flight.env.close()
         laps = ", ".join(f"{duration:.2f} s" for duration in result.lap_times)
         say(f"{result.summary()}\n{'laps':<18} {laps or 'none'}")
-        write(directory, flight.env.track, result)
+        print(f"{'files':<18} {directory}: {report_flight(directory, flight.env.track, result)}")
         if outside is not None:
-            film_from_outside(directory, outside, flight.env.track, result.trajectories[0])
+            films = film_from_outside(directory, outside, flight.env.track, result.trajectories[0])
+            print(f"{'from outside':<18} {directory}: {films}")
 
 
 @contextmanager
@@ -205,11 +169,8 @@ def in_words(episode: Episode) -> str:
 def pilots_flight(config: FlyConfig) -> PlannedFlight:
     """Prepare a flight by a pilot that sees the true state, or by hand."""
     pilot, preset = config.pilot or PILOT, config.preset or PRESET
-    camera = Camera()
-    if config.image_size is not None:
-        camera = replace(camera, width=config.image_size, height=config.image_size)
-    if config.camera_tilt is not None:
-        camera = replace(camera, tilt=config.camera_tilt)
+    looks: dict[str, Any] = {"width": config.image_size, "height": config.image_size, "tilt": config.camera_tilt}
+    camera = replace(Camera(), **{name: value for name, value in looks.items() if value is not None})
     worlds: dict[str, Any] = {"evaluation": True, "camera": camera, "renderer": config.renderer}
     if config.control_rate is not None:
         worlds["control_rate"] = config.control_rate
@@ -254,50 +215,10 @@ def agents_flight(config: FlyConfig) -> PlannedFlight:
     return PlannedFlight(course.base, partial(course.evaluate, value_function=restored.flyer.value_function()))
 
 
-def write(directory: Path, track: Track, result: Evaluation) -> None:
-    """Write numbers and plot, and of flights with images a video and a GIF; print where."""
-    trajectory = result.trajectories[0]
-    (directory / EVALUATION).write_text(result.to_json())
-    stored = write_flight(directory / "flight", trajectory, track)
-    plot_top_down(track, trajectory, directory / "top_down.png")
-    for earlier in ("onboard.mp4", "onboard.gif", "chase.mp4", "chase.gif"):
-        (directory / earlier).unlink(missing_ok=True)  # so that none is mistaken for this flight's
-    files = f"{directory}: {EVALUATION}, {', '.join(stored)}, top_down.png"
-    if trajectory.pixels is None:
-        print(f"{'files':<18} {files} (there is no video: the agent sees numbers)")
-        return
-    words = race_words(track, trajectory)
-    film = caption(enlarge_to_watch(trajectory.pixels.numpy()), words)
-    filmed = write_video(directory / "onboard.mp4", film, fps=1 / trajectory.control_dt, scale=1)
-    first, last = second_lap(trajectory)
-    frames = onboard_beside_map(track, trajectory.part(first, last), GIF_SIZE)[::GIF_STRIDE]
-    gif = caption(frames, words[first : last + 1 : GIF_STRIDE])
-    size = write_gif(directory / "onboard.gif", gif, fps=1 / (GIF_STRIDE * trajectory.control_dt))
-    print(f"{'files':<18} {files}, {'onboard.mp4, ' if filmed else ''}onboard.gif ({size / 1e6:.2f} MB)")
-
-
 def open_view(env: DroneRacingEnv) -> ChaseView:
     """Make the chase view, so that missing OpenGL fails before the flight."""
     with plain_errors():
         return ChaseView(env.track, env.worlds.parameters, size=GIF_SIZE)
-
-
-def film_from_outside(directory: Path, view: ChaseView, track: Track, trajectory: Trajectory) -> None:
-    """Write a video of the whole flight and a GIF of its second lap, seen from outside and by the drone."""
-    frames, words = chase_beside_onboard(view, trajectory), race_words(track, trajectory)
-    view.close()
-    filmed = write_video(directory / "chase.mp4", caption(frames, words), fps=1 / trajectory.control_dt, scale=1)
-    first, last = second_lap(trajectory)
-    shown = slice(first, last + 1, CHASE_STRIDE)
-    gif = caption(frames[shown], words[shown])
-    size = write_gif(directory / "chase.gif", gif, fps=1 / (CHASE_STRIDE * trajectory.control_dt), colors=CHASE_COLORS)
-    print(f"{'from outside':<18} {directory}: {'chase.mp4, ' if filmed else ''}chase.gif ({size / 1e6:.2f} MB)")
-
-
-def second_lap(trajectory: Trajectory) -> tuple[int, int]:
-    """Return the first and last step of the second lap, flown at racing speed; else of the flight's beginning."""
-    ends = (np.diff(laps_completed(trajectory)).nonzero()[0] + 1).tolist()
-    return (ends[0], ends[1]) if len(ends) > 1 else (0, min(GIF_STEPS, len(trajectory.action)))
 
 
 if __name__ == "__main__":

@@ -13,7 +13,6 @@ Read docs/hil_safety.md before anything with propellers. Only actor=pilot and re
 """
 
 import json
-import math
 import sys
 from collections.abc import Callable
 from contextlib import ExitStack, closing
@@ -28,8 +27,7 @@ from omegaconf.errors import OmegaConfBaseException
 
 from dreamer_racing.envs.tracks import Track, describe_track, load_track
 from dreamer_racing.export.agents import existing_agent_path
-from dreamer_racing.hil.battery import STALE
-from dreamer_racing.hil.chain import FlightChain, Outputs, describe_outputs, read_inputs
+from dreamer_racing.hil.chain import FlightChain, Outputs, first_difference
 from dreamer_racing.hil.configuration import (
     IDENTIFY,
     PILOT,
@@ -49,7 +47,7 @@ from dreamer_racing.hil.flyer import ActorFlyer, Flyer, trained_track
 from dreamer_racing.hil.identify import IdentificationFlyer
 from dreamer_racing.hil.links import make_link
 from dreamer_racing.hil.links.link import TransportLink
-from dreamer_racing.hil.loop import FlightLoop
+from dreamer_racing.hil.loop import FlightLoop, summary_lines
 from dreamer_racing.hil.pose import PoseSource
 from dreamer_racing.hil.pose_sources import make_poses
 from dreamer_racing.hil.progress import flying_laps
@@ -105,7 +103,7 @@ def fly(config: HilConfig) -> int:
         with plain_hil_errors():
             opened.close()
             summary = conclude(config, flight, ended)
-    say(summary)
+    print(*summary_lines(summary), sep="\n")
     wanted = 0 if config.laps is None else config.laps * flight.track.num_gates
     flown = flight.loop.flew and len(summary["passes"]) >= wanted
     return 0 if flown and not ended.startswith("cut") else 1
@@ -171,53 +169,19 @@ def conclude(config: HilConfig, flight: Prepared, ended: str) -> dict[str, Any]:
         "loop": flight.loop.statistics.summary(),
         "poses": {"rejected": flight.poses.rejected, "out_of_order": chain.clock.out_of_order},
         "commands_dropped": flight.link.dropped,
-        "battery": battery_summary(config, chain, flight.link),
+        "battery": None,
     }
+    if (thrust := flight.link.thrust) is not None:
+        battery = {"voltage_set": config.voltage, "voltage": thrust.voltage, "rejected": flight.link.rejected}
+        summary["battery"] = battery | ({"readings": 0} if chain.battery is None else chain.battery.summary())
     if config.record:
         (flight.folder / STATISTICS).write_text(json.dumps(summary, indent=2) + "\n", encoding="utf-8")
     return summary
 
 
-def battery_summary(config: HilConfig, chain: FlightChain, link: TransportLink) -> dict[str, Any] | None:
-    """Return the thrust map's voltage at the end, and counts of battery readings; None without a thrust map."""
-    if link.thrust is None:
-        return None
-    summary = {"voltage_set": config.voltage, "voltage": link.thrust.voltage, "rejected": link.rejected}
-    if (battery := chain.battery) is None:
-        return {**summary, "readings": 0}
-    age = battery.age if math.isfinite(battery.age) else None
-    return {**summary, "readings": battery.readings, "implausible": battery.implausible, "last_reading_age_s": age}
-
-
 def as_json(config: HilConfig) -> dict[str, Any]:
     """Return the configuration as JSON values."""
     return cast(dict[str, Any], OmegaConf.to_container(OmegaConf.structured(config), enum_to_str=True))
-
-
-def say(summary: dict[str, Any]) -> None:
-    """Print the summary of a flight."""
-    laps = ", ".join(f"{lap:.2f} s" for lap in summary["laps"]) or "none"
-    print(f"ended: {summary['ended']}")
-    print(f"gates passed: {len(summary['passes'])}, laps, from first gate to first gate: {laps}")
-    for name, row in summary["loop"].items():
-        if isinstance(row, dict):
-            print(f"{name:<9} p50 {row['p50_ms']:6.2f} ms   p99 {row['p99_ms']:6.2f} ms   max {row['max_ms']:6.2f} ms")
-    print(f"ticks: {summary['loop']['ticks']}, overruns: {summary['loop']['overruns']}")
-    rejected, out_of_order = summary["poses"]["rejected"], summary["poses"]["out_of_order"]
-    if rejected or out_of_order:
-        print(f"poses ignored: {rejected} invalid messages, {out_of_order} out of order")
-    if summary["battery"] is not None:
-        print(in_words(summary["battery"]))
-
-
-def in_words(battery: dict[str, Any]) -> str:
-    """Return, in words, the voltage that the thrust map used, and where it came from."""
-    if not battery["readings"]:
-        return f"battery: no usable reading; thrust was computed with voltage={battery['voltage_set']:g}"
-    age = battery["last_reading_age_s"]
-    old = f", the last one {age:.1f} s before the end: STALE" if age > STALE else ""
-    left_out = f", {battery['implausible']} implausible ones ignored" if battery["implausible"] else ""
-    return f"battery: {battery['voltage']:.2f} V at the end, from {battery['readings']} readings{left_out}{old}"
 
 
 def replay(config: HilConfig) -> int:
@@ -239,29 +203,13 @@ def replay(config: HilConfig) -> int:
     flyer, _ = make_flyer(settings, track)
     settings.renderer = config.renderer
     with closing(make_chain(settings, flyer, track)) as chain:
-        return play(flight, chain)
-
-
-def play(flight: Flight, chain: FlightChain) -> int:
-    """Pass every tick of a flight through a chain; return 0 if all outputs are as recorded, else 1."""
-    chain.warm_up()
-    for index, tick in enumerate(flight.ticks):
-        again = json.loads(json.dumps(describe_outputs(chain.tick(read_inputs(tick["in"])))))
-        if differing := [name for name, value in tick["out"].items() if not same(value, again.get(name))]:
-            name = differing[0]
-            print(f"tick {index}: {name} was {tick['out'][name]}, and is {again.get(name)} now", file=sys.stderr)
-            return 1
+        chain.warm_up()
+        difference = first_difference(chain, flight.ticks)
+    if difference:
+        print(difference, file=sys.stderr)
+        return 1
     print(f"replayed: {len(flight.ticks)} ticks, all equal to the recording{'' if flight.whole else ' (cut off)'}")
     return 0
-
-
-def same(one: Any, other: Any) -> bool:
-    """Return whether two JSON values are equal, bit for bit; NaN equals NaN."""
-    if isinstance(one, list) and isinstance(other, list):
-        return len(one) == len(other) and all(map(same, one, other))
-    if isinstance(one, float) and isinstance(other, float) and math.isnan(one):
-        return math.isnan(other)
-    return one == other
 
 
 def report(config: HilConfig) -> int:

@@ -12,14 +12,10 @@ import logging
 import math
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from composing.entry import plain_errors, recipe
 
 from dreamer_racing.envs.drone.variations import SUFFIXES
-
-if TYPE_CHECKING:
-    from dreamer_racing.identification.fitting import Fit
 
 
 @dataclass
@@ -38,54 +34,30 @@ class IdentificationConfig:
 
 @recipe("identification", IdentificationConfig)
 def main(config: IdentificationConfig) -> None:
-    """Read, fit, write."""
+    """Fit a drone to the flight, write it, and print the results."""
     with plain_errors():
-        identify(config)
+        if config.flight is None:
+            raise ValueError("flight= is missing: a folder in which recipes/hil.py flew, or a table.")
+        from dreamer_racing.envs.drone.parameters import load_preset, save_drone
+        from dreamer_racing.identification.fitting import fit
+        from dreamer_racing.identification.recorded import read_recorded
 
-
-def identify(config: IdentificationConfig) -> None:
-    """Fit a drone to the flight, write it, and print the results.
-
-    Raises:
-        ValueError: The flight is missing, too short or too quiet, the preset has no Betaflight, or the fit diverged.
-    """
-    if config.flight is None:
-        raise ValueError("flight= is missing: a folder in which recipes/hil.py flew, or a table.")
-    from dreamer_racing.envs.drone.parameters import load_preset, save_drone
-    from dreamer_racing.identification.fitting import fit
-    from dreamer_racing.identification.recorded import read_recorded
-
-    nominal, recorded = load_preset(config.preset), read_recorded(config.flight)
-    recorded.check(f"flight={config.flight}")
-    logging.getLogger("dreamer_racing.identification").setLevel(logging.INFO)
-    found = fit(recorded, nominal)
-    about = {
-        "flight": Path(config.flight).name,
-        "begun_with": Path(config.preset).name,
-        "error_of_rates": {axis: round(error, 4) for axis, error in found.errors.items()},
-        "not_told": list(found.unknown),
-    }
-    if not all(math.isfinite(error) for error in found.errors.values()):
-        raise ValueError("The fit diverged: start from a preset= closer to the drone.")
-    save_drone(Path(config.output), found.parameters, about)
-    say(config, found)
-
-
-def say(config: IdentificationConfig, found: "Fit") -> None:
-    """Print the fitted parameters."""
-    print(f"{'':<10}{'relative':>10}{'±':>8}  (to {config.preset}; delay in ms, added)")
-    for name, value in found.values.items():
-        scale = 1e3 if name == "delay" else 1.0
-        width = scale * found.deviations[name] * (1.0 if name == "delay" else value)
-        remark = "   poorly determined" if name in found.unknown else ""
-        print(f"{name:<10}{scale * value:>10.3f}{width:>8.3f}{remark}")
-    for axis, error in found.errors.items():
-        print(f"{axis}: RMS error of body rates {error:.1%} of the commanded rates ({found.before[axis]:.1%} before)")
-    if found.thrust is None:
-        print("thrust: no force was measured")
-    else:
-        print(f"thrust: {found.thrust:.3f} of the assumed thrust: multiply full_thrust= of recipes/hil.py by it")
-    print(f"written to {config.output}: env=betaflight env.preset={config.output}")
+        nominal, recorded = load_preset(config.preset), read_recorded(config.flight)
+        recorded.check(f"flight={config.flight}")
+        logging.getLogger("dreamer_racing.identification").setLevel(logging.INFO)
+        found = fit(recorded, nominal)
+        about = {
+            "flight": Path(config.flight).name,
+            "begun_with": Path(config.preset).name,
+            "error_of_rates": {axis: round(error, 4) for axis, error in found.errors.items()},
+            "not_told": list(found.unknown),
+        }
+        if not all(math.isfinite(error) for error in found.errors.values()):
+            raise ValueError("The fit diverged: start from a preset= closer to the drone.")
+        save_drone(Path(config.output), found.parameters, about)
+        for line in found.lines(config.preset):
+            print(line)
+        print(f"written to {config.output}: env=betaflight env.preset={config.output}")
 
 
 if __name__ == "__main__":

@@ -21,6 +21,7 @@ from omegaconf import DictConfig
 
 from dreamer_racing import parallel
 from dreamer_racing.envs import DroneRacingEnv
+from dreamer_racing.evaluation.held_out import measure, measure_lag
 from dreamer_racing.learners.latent_ppo import LatentPPO
 from dreamer_racing.modules import Interface
 from dreamer_racing.training.schedule import ModelLag, Schedule
@@ -55,7 +56,7 @@ def train(config: LatentPPORunConfig, session: Session) -> None:
         learner=learner,
         env=env,
         rollouts=rollouts,
-        evaluator=building.make_run_evaluator(config, session.directory.path, learner),
+        evaluator=building.make_evaluator(config, session.directory.path, learner),
         tracker=building.make_tracker(config),
         replay=replay,
         ratio=ratio,
@@ -77,7 +78,7 @@ def train(config: LatentPPORunConfig, session: Session) -> None:
 
         # Apply the schedules; the actor waits while the model's error on the newest records is too large.
         if lag.due(session.env_steps) and session.counters["updates"]:
-            session.log(building.measure_lag(session, config, learner, replay, lag))
+            session.log(measure_lag(session, learner, replay, lag, config.newest_records))
         scheduled = schedule.at(session.env_steps)
         if "start_on_line" in scheduled:
             cast(DroneRacingEnv, env).worlds.start_on_line = scheduled.pop("start_on_line")
@@ -98,7 +99,7 @@ def train(config: LatentPPORunConfig, session: Session) -> None:
         if session.due("evaluate"):
             session.evaluate()
         if session.due("log"):
-            session.write_row(building.measure(session, learner, replay, scheduled))
+            session.write_row(measure(session, learner, replay, scheduled))
         session.save_if_due()
 
 

@@ -15,15 +15,14 @@ from typing import Any
 
 from composing.building import shared_env_arguments
 from composing.entry import plain_disk_errors, plain_errors, recipe
-from composing.restoring import FlightConfig, Restored, report_heading, restore
+from composing.restoring import FlightConfig, Restored, restore
 from composing.schema import RunConfig
 
 from dreamer_racing.envs.simulator.scene import Camera
 from dreamer_racing.envs.tracks import Track, decoys_for, with_decoys
 from dreamer_racing.evaluation.image_corruptions import CORRUPTIONS, CorruptedPolicy
-from dreamer_racing.evaluation.protocol import MODES, Result, fly, results_table
-from dreamer_racing.evaluation.sight import Sight, gate_table, measure_sight, sight_table
-from dreamer_racing.evaluation.trajectory import Trajectory
+from dreamer_racing.evaluation.protocol import MODES, Result, fly
+from dreamer_racing.evaluation.sight import NO_NOISE, START_NOISE, SightResults, measure_sight, sight_report
 from dreamer_racing.figures.protocol import plot_sight
 from dreamer_racing.settings import COUNT, setting
 from dreamer_racing.terminal import say
@@ -31,8 +30,6 @@ from dreamer_racing.training.directory import fresh_directory, replace_text
 
 RESULT = "perception.json"
 WITHOUT, WITH = "without decoys", "with decoys"
-NO_NOISE, START_NOISE = 0.0, 1.0  # noise of starts, in units of training's; with it no two flights are the same
-START_TEXT = {NO_NOISE: "From the start pose:\n", START_NOISE: "From starts with the noise of training:\n"}
 
 
 @dataclass
@@ -59,25 +56,6 @@ def main(config: PerceptionConfig) -> None:
     with plain_disk_errors():
         write(directory, looked, corrupted, provenance, shared_env_arguments(restored.trained)["camera"])
     say(f"\nwritten to {directory}")
-
-
-@dataclass
-class SightResults:
-    """Results of the flights without or with decoys, and what the camera was pointed at."""
-
-    track: Track
-    gates_per_episode: float
-    success_rate: float
-    trajectory: Trajectory  # the first of them
-    sights: dict[str, Sight]
-
-    def to_dict(self) -> dict[str, Any]:
-        """Return the numbers as JSON values."""
-        return {
-            "gates_per_episode": self.gates_per_episode,
-            "success_rate": self.success_rate,
-            "sights": {thing: sight.to_dict() for thing, sight in self.sights.items()},
-        }
 
 
 def tracks_to_fly(trained: RunConfig) -> dict[str, Track]:
@@ -137,7 +115,7 @@ def write(
     title = f"{provenance['algorithm']} on {provenance['track']}, {provenance['env_steps']:,} env_steps"
     flights = {name: (kind.track, kind.trajectory, kind.sights) for name, kind in looked.items()}
     plot_sight(flights, camera, directory / "perception.png", title)
-    (directory / "perception.md").write_text(to_markdown(title, looked, corrupted, provenance), encoding="utf-8")
+    (directory / "perception.md").write_text(sight_report(title, looked, corrupted, provenance), encoding="utf-8")
     numbers = {
         "flights": {name: kind.to_dict() for name, kind in looked.items()},
         "image_corruptions": [
@@ -148,20 +126,6 @@ def write(
         "provenance": provenance,
     }
     replace_text(directory / RESULT, json.dumps(numbers, indent=2, allow_nan=False) + "\n")
-
-
-def to_markdown(
-    title: str, looked: dict[str, SightResults], corrupted: dict[float, list[Result]], provenance: dict[str, Any]
-) -> str:
-    """Return the tables as a Markdown page."""
-    parts = [report_heading(title, provenance), "## What the camera points at\n", START_TEXT[START_NOISE]]
-    sights = {name: kind.sights for name, kind in looked.items()}
-    parts += [sight_table(sights), "Share of time in view, gate by gate:\n", gate_table(sights)]
-    parts.append("![perception](perception.png)\n")
-    parts.append("## Corrupted images\n")
-    for noise, results in corrupted.items():
-        parts += [START_TEXT[noise], results_table(results, "images")]
-    return "\n".join(parts)
 
 
 if __name__ == "__main__":

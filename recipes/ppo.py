@@ -42,7 +42,7 @@ def train(config: PPORunConfig, session: Session) -> None:
         learner=learner,
         env=env,
         rollouts=rollouts,
-        evaluator=building.make_run_evaluator(config, session.directory.path, learner),
+        evaluator=building.make_evaluator(config, session.directory.path, learner),
         tracker=building.make_tracker(config),
         curriculum=curriculum,
     )

@@ -45,7 +45,7 @@ def train(config: SACRunConfig, session: Session) -> None:
         learner=learner,
         env=env,
         rollouts=rollouts,
-        evaluator=building.make_run_evaluator(config, session.directory.path, learner),
+        evaluator=building.make_evaluator(config, session.directory.path, learner),
         tracker=building.make_tracker(config),
         replay=replay,
         ratio=ratio,

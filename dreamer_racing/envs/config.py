@@ -118,6 +118,14 @@ class EnvConfig:
         except ValueError as error:
             raise ValueError(f"env.{error}") from error
 
+    def check_shares(self) -> None:
+        """Refuse a share of starts behind gates if all episodes begin on the racing line."""
+        if self.start_on_line == 1 and self.start_beyond_gate:
+            raise ValueError(
+                f"env.start_beyond_gate={self.start_beyond_gate:g} is a share of the episodes that do not begin on the "
+                "racing line, and env.start_on_line=1 leaves none: lower that, or set env.start_beyond_gate=0."
+            )
+
     def check_custom_functions(self, track: Track) -> None:
         """Check user-defined reward and vector functions by running them for one step."""
         if self.reward is None and self.vector is None:

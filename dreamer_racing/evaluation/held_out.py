@@ -5,20 +5,51 @@ Shapes: W windows of T records, C context records, H horizon, F features.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
+from typing import Any
 
 import torch
 from tensordict import TensorDictBase
 from torch import Tensor
 
+from dreamer_racing import parallel
+from dreamer_racing.experience.replay import StreamReplay
 from dreamer_racing.learners.dreamer_v3 import DreamerV3
 from dreamer_racing.learners.update import WorldModelLearner
 from dreamer_racing.losses import imagine
 from dreamer_racing.modules.rssm import join_features
+from dreamer_racing.training.schedule import ModelLag
+from dreamer_racing.training.session import Session
 
 SEEN = 16
 """Context records that the model observes before it predicts."""
+WINDOWS, RECORDS = 32, 2_000
+"""Held-out windows per measurement, and the newest records of a world that they are drawn from."""
+
+
+def measure(
+    session: Session, learner: WorldModelLearner, replay: StreamReplay, scheduled: Mapping[str, float]
+) -> dict[str, Tensor | float]:
+    """Return a run's current hyperparameters, and `held_out_metrics` on the newest held-out records."""
+    groups = zip(("world_model", "behavior"), learner.optimizer.param_groups, strict=True)
+    numbers: dict[str, Any] = {f"schedule/{name}": value for name, value in scheduled.items()}
+    numbers |= {f"learning_rate/{name}": group["lr"] for name, group in groups}
+    windows = replay.held_out(WINDOWS, SEEN + learner.config.imagination_horizon, RECORDS)
+    if windows is None or not session.counters["updates"]:
+        return numbers
+    with session.undisturbed():
+        return numbers | held_out_metrics(learner, windows)
+
+
+def measure_lag(
+    session: Session, learner: WorldModelLearner, replay: StreamReplay, lag: ModelLag, length: int
+) -> dict[str, Tensor | float]:
+    """Measure the world model's error on the newest ``length`` records of each world, before it trains on them."""
+    if (windows := replay.newest(length)) is None:
+        return {}
+    with session.undisturbed():
+        return lag.add_fresh_error(parallel.averaged(world_model_metrics(learner, windows)))
 
 
 @torch.no_grad()

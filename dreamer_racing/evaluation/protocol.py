@@ -193,6 +193,13 @@ def fly(
         course.close()
 
 
+def report_heading(title: str, provenance: dict[str, Any]) -> str:
+    """Return the head of a Markdown report: the title, the command, and where the numbers come from."""
+    facts = {name: value for name, value in provenance.items() if name != "command" and value is not None}
+    text = "; ".join(f"{name.replace('_', ' ')} {value}" for name, value in facts.items())
+    return f"# {title}\n\n```bash\n{provenance['command']}\n```\n\n{text}.\n"
+
+
 def results_table(results: Sequence[Result], condition: str = "condition") -> str:
     """Return a Markdown table with one row per result.
 
@@ -223,6 +230,11 @@ def results_table(results: Sequence[Result], condition: str = "condition") -> st
                 crashes_in_words(flown),
             )
         )
+    return as_markdown(rows)
+
+
+def as_markdown(rows: Sequence[Sequence[str]]) -> str:
+    """Return the rows of a table in Markdown."""
     return "\n".join("| " + " | ".join(row) + " |" for row in rows) + "\n"
 
 

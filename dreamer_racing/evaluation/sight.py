@@ -20,11 +20,14 @@ from torch import Tensor
 from dreamer_racing.envs.simulator.camera_view import is_in_view, points_in_camera
 from dreamer_racing.envs.simulator.scene import Camera
 from dreamer_racing.envs.tracks import Gate, Track
+from dreamer_racing.evaluation.protocol import Result, as_markdown, report_heading, results_table
 from dreamer_racing.evaluation.trajectory import Trajectory
 
 NEXT_GATE, NEAREST_VISIBLE_GATE = "next gate", "nearest visible gate"
 QUANTILES = (5, 25, 50, 75, 95)  # percent
 BIN_DEGREES = 5
+NO_NOISE, START_NOISE = 0.0, 1.0  # noise of starts, in units of training's; with it no two flights are the same
+START_TEXT = {NO_NOISE: "From the start pose:\n", START_NOISE: "From starts with the noise of training:\n"}
 
 
 @dataclass(frozen=True)
@@ -148,7 +151,7 @@ def sight_table(flights: Mapping[str, Mapping[str, Sight]]) -> str:
             values = [numbers["angle_mean_degrees"], *numbers["angle_quantiles_degrees"].values()]
             cells = ("–" if value is None else f"{value:.0f}°" for value in values)
             rows.append((flight, name, f"{sight.share_in_view:.0%}", *cells))
-    return _as_markdown(rows)
+    return as_markdown(rows)
 
 
 def gate_table(flights: Mapping[str, Mapping[str, Sight]]) -> str:
@@ -161,8 +164,37 @@ def gate_table(flights: Mapping[str, Mapping[str, Sight]]) -> str:
     head = ("in view", *flights)
     rows = [head, ("---",) * len(head)]
     rows += [(gate, *(f"{sights[gate].share_in_view:.0%}" for sights in flights.values())) for gate in gates]
-    return _as_markdown(rows)
+    return as_markdown(rows)
 
 
-def _as_markdown(rows: Sequence[Sequence[str]]) -> str:
-    return "\n".join("| " + " | ".join(row) + " |" for row in rows) + "\n"
+@dataclass
+class SightResults:
+    """Results of the flights without or with decoys, and what the camera was pointed at."""
+
+    track: Track
+    gates_per_episode: float
+    success_rate: float
+    trajectory: Trajectory  # the first of them
+    sights: dict[str, Sight]
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return the numbers as JSON values."""
+        return {
+            "gates_per_episode": self.gates_per_episode,
+            "success_rate": self.success_rate,
+            "sights": {thing: sight.to_dict() for thing, sight in self.sights.items()},
+        }
+
+
+def sight_report(
+    title: str, looked: dict[str, SightResults], corrupted: dict[float, list[Result]], provenance: dict[str, Any]
+) -> str:
+    """Return the tables as a Markdown page; flights with corrupted images are given by the noise of their starts."""
+    parts = [report_heading(title, provenance), "## What the camera points at\n", START_TEXT[START_NOISE]]
+    sights = {name: kind.sights for name, kind in looked.items()}
+    parts += [sight_table(sights), "Share of time in view, gate by gate:\n", gate_table(sights)]
+    parts.append("![perception](perception.png)\n")
+    parts.append("## Corrupted images\n")
+    for noise, results in corrupted.items():
+        parts += [START_TEXT[noise], results_table(results, "images")]
+    return "\n".join(parts)

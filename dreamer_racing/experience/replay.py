@@ -27,7 +27,6 @@ from torchrl.data import TensorDictReplayBuffer
 from torchrl.envs.transforms import Transform
 
 from dreamer_racing.experience.streams import (
-    END_KEYS,
     RACE_REWARD_KEYS,
     RecordStorage,
     StreamMemmapStorage,
@@ -312,27 +311,6 @@ def _expanded(frame: bytes, shape: tuple[int, ...], dtype: torch.dtype) -> Tenso
     except zstandard.ZstdError as error:
         raise ValueError(f"A frame of the saved replay is damaged: {error}.") from error
     return torch.frombuffer(bytearray(content), dtype=dtype).view(shape)
-
-
-def replay_bytes(
-    capacity: int,
-    image_shape: Sequence[int] = (64, 64, 3),
-    action_size: int = 4,
-    numbers: int = 0,
-    latents: LatentFormat | None = None,
-) -> int:
-    """Return the size in bytes of a replay of ``capacity`` records (12.3 KB each at 64×64).
-
-    Args:
-        capacity: Number of records.
-        image_shape: Shape of ``pixels``.
-        action_size: A.
-        numbers: Number of float32 values observed besides the image: ``vector`` and the privileged one.
-        latents: Format of stored latents, if any.
-    """
-    flags, context = 1 + len(END_KEYS), latents.bytes if latents else 0
-    floats = action_size + len(RACE_REWARD_KEYS) + numbers
-    return capacity * (math.prod(image_shape) + 4 * floats + flags + context)
 
 
 def make_replay(

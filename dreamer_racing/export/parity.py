@@ -6,8 +6,10 @@ Shape legend: A action, L latents of C classes, V vector entries, T steps of a r
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -16,7 +18,7 @@ from torch import Tensor
 
 from dreamer_racing.envs.policy_memory import with_memory
 from dreamer_racing.envs.torchrl_env import DroneRacingEnv
-from dreamer_racing.export.onnx_actor import RecurrentActor
+from dreamer_racing.export.onnx_actor import CONTRACT, OnnxActor, RecurrentActor, measure_latency, read_contract
 from dreamer_racing.modules import DreamerPolicy
 from dreamer_racing.modules.agent import Agent
 
@@ -154,6 +156,21 @@ def check_parity(actors: Mapping[str, RecurrentActor], flight: RecordedFlight, s
             raise
         hint = "Rounding may also change a sample on the border of two classes: try another seed."
         raise ParityError(f"{error} {hint}") from None
+
+
+def measure_latencies(
+    step: Callable[..., Sequence[Tensor]], flight: RecordedFlight, output: Path, parts: bool
+) -> Iterator[str]:
+    """Yield lines on how long an `ActorStep` takes, and its export; with ``parts`` also from image to action."""
+    contract = read_contract(output.parent / CONTRACT)
+    actors = {"onnxruntime": OnnxActor(output, whole=True), "torch": TorchActor(contract, step)}
+    imu = {} if flight.imu is None else {"imu": flight.imu[0]}
+    for name, actor in actors.items():
+        yield f"one step, 1 thread, {name}: {measure_latency(partial(actor.step, **imu), flight.observations)}"
+    if parts:
+        actor = OnnxActor(output)
+        latency = measure_latency(partial(actor.step, **imu), flight.observations, actor.prepare)
+        yield f"of this, from image to action: {latency}"
 
 
 def _replay(actor: RecurrentActor, flight: RecordedFlight, noise: np.ndarray | None) -> tuple[np.ndarray, np.ndarray]:

@@ -16,17 +16,22 @@ from typing import Any
 import torch
 
 from dreamer_racing.envs.torchrl_env import DroneRacingEnv
+from dreamer_racing.evaluation.protocol import MODES
 from dreamer_racing.export.actor_step import WEIGHTS
+from dreamer_racing.export.agents import agent_path, agents_that_ship
 from dreamer_racing.export.contract import describe_camera, hash_tensors
 from dreamer_racing.export.onnx_actor import CONTRACT, PARTS, read_contract
 from dreamer_racing.export.weights_file import read_weights
+from dreamer_racing.learners.saved import check_size
 from dreamer_racing.modules import DreamerPolicy, Interface, ModelSize
 from dreamer_racing.modules.agent import Agent
 from dreamer_racing.settings import check_choice
-from dreamer_racing.training.checkpoint import load_state
+from dreamer_racing.training.checkpoint import load_state, newest_sound
+from dreamer_racing.training.directory import RunDirectory
 
 AGENT, CONFIG, ACTOR = "agent.json", "config.yaml", "actor.onnx"
 FILES = (ACTOR, WEIGHTS, CONTRACT, CONFIG, AGENT)
+BY_ITEM = ("episodes", "crashes_by_gate")  # entries of an evaluation that agent.json leaves out
 AVERAGED, TRAINED = "averaged", "trained"
 CHOICES = ("auto", AVERAGED, TRAINED)
 """Choices of a checkpoint's weights: ``auto`` takes the averaged ones if the checkpoint has them."""
@@ -151,6 +156,20 @@ class ShippedAgent:
         """Return None, because an agent folder has no critic."""
 
 
+def load_trained(folder: Path, env: DroneRacingEnv, *agents: Agent) -> None:
+    """Load the weights of an agent folder into agents that go on training in an environment, as `load_networks`.
+
+    Raises:
+        ValueError: The agents have another size, or the environment differs from that of training.
+    """
+    contract = read_contract(folder / CONTRACT)
+    for agent in agents:
+        check_size(contract["model"], agent.size)
+    check_env(folder, contract, env)
+    for agent in agents:
+        load_networks(folder, agent)
+
+
 def load_networks(folder: Path, agent: Agent) -> None:
     """Load the weights of an agent folder into encoder, RSSM and actor.
 
@@ -171,6 +190,37 @@ def load_networks(folder: Path, agent: Agent) -> None:
 def is_agent(folder: str | Path) -> bool:
     """Return whether a folder is an agent folder."""
     return (Path(folder) / AGENT).is_file()
+
+
+def find_trained(name: str) -> Path:
+    """Find the agent or checkpoint that `checkpoint=` or `agent=` names.
+
+    Args:
+        name: of an included agent; or path of an agent's folder, a run directory, or a checkpoint.
+
+    Returns:
+        The folder of the agent, or the newest checkpoint there.
+
+    Raises:
+        FileNotFoundError: there is neither; the message names the included agents.
+    """
+    path = agent_path(name)
+    if is_agent(path):
+        return path.absolute()
+    try:
+        return newest_sound(name, ("learner", "counters"))
+    except FileNotFoundError as error:
+        raise FileNotFoundError(f"{error} {agents_that_ship()}") from error
+
+
+def config_folder(checkpoint: Path) -> Path:
+    """Return the folder that holds the configuration of a checkpoint or an agent."""
+    return checkpoint if is_agent(checkpoint) else RunDirectory.of(checkpoint).path
+
+
+def results_of(checkpoint: Path) -> Path:
+    """Return the folder for results of a checkpoint or an agent."""
+    return Path("runs") / f"agent_{checkpoint.name}" if is_agent(checkpoint) else RunDirectory.of(checkpoint).path
 
 
 def read_about(folder: str | Path) -> dict[str, Any]:
@@ -222,6 +272,55 @@ def check_env(folder: str | Path, contract: dict[str, Any], env: DroneRacingEnv)
                 f"{setting}={given}: the agent {folder} was trained with {setting}={trained}, and flies "
                 "with nothing else."
             )
+
+
+def newest_evaluation(folder: Path, weights_sha256: str, track_sha256: str) -> Path:
+    """Return a run's latest evaluation of these weights on this track; without one, a file that is refused when read.
+
+    Each evaluation has a folder of its own.
+    """
+    first = RunDirectory(folder).evaluation_file
+    there = first.parent.parent.glob(f"{first.parent.name}*/{first.name}")
+    texts = {path: path.read_text(encoding="utf-8") for path in there}
+    of_these = [path for path, text in texts.items() if f'"weights_sha256": "{weights_sha256}"' in text]
+    fitting = [path for path in of_these if f'"track_sha256": "{track_sha256}"' in texts[path]]
+    return max(fitting or of_these, key=lambda path: path.stat().st_mtime, default=first)
+
+
+def read_evaluation(
+    path: Path, checkpoint: Path, weights_sha256: str, track: str, track_sha256: str, how: str
+) -> dict[str, Any]:
+    """Return the statistics of an evaluation of these weights on the track that they were trained on, for agent.json.
+
+    Args:
+        path: evaluation.json.
+        checkpoint: Checkpoint of the agent, for messages.
+        weights_sha256: Hash of the weights.
+        track: Track that the agent was trained on, for messages.
+        track_sha256: Hash of that track.
+        how: A sentence that says how to make the evaluation, for messages.
+
+    Raises:
+        FileNotFoundError: There is none.
+        ValueError: It is of other weights or another track, or no evaluation.
+    """
+    if not path.is_file():
+        raise FileNotFoundError(f"There is no evaluation {path}: an agent ships with its results. {how}")
+    try:
+        written = json.loads(path.read_text(encoding="utf-8"))
+        made = written["provenance"]
+    except (ValueError, KeyError, TypeError) as error:
+        raise ValueError(f"{path} is not an evaluation by recipes/evaluate.py ({error!r}). {how}") from error
+    if made.get("weights_sha256") != weights_sha256:
+        raise ValueError(f"{path} is an evaluation of other weights than those of {checkpoint}. {how}")
+    if made.get("track_sha256") is None:
+        raise ValueError(f"{path} does not say which track it was flown on. {how}")
+    if made["track_sha256"] != track_sha256:
+        there = "another track, or with other decoys" if made["track"] == track else made["track"]
+        raise ValueError(f"{path} was flown on {there}, and the agent was trained on {track}. {how}")
+    names = ("episodes", "seed", "start_noise", "preset", "decoys", "date", "commit")
+    statistics = {mode: {name: value for name, value in written[mode].items() if name not in BY_ITEM} for mode in MODES}
+    return {**{name: made[name] for name in names}, **statistics}
 
 
 def _size(saved: dict[str, Any]) -> ModelSize:

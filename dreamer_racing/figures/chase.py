@@ -3,12 +3,17 @@
 from __future__ import annotations
 
 import math
+from pathlib import Path
 
 import numpy as np
 
 from dreamer_racing.envs.simulator.chase import ChaseView
+from dreamer_racing.envs.tracks import Track
 from dreamer_racing.evaluation.trajectory import Trajectory
-from dreamer_racing.figures.film import enlarge
+from dreamer_racing.figures.film import enlarge, write_gif, write_video
+from dreamer_racing.figures.hud import caption, race_words, second_lap
+
+STRIDE, COLORS = 3, 32  # control steps a frame, and colours, of chase.gif, in which the whole picture moves
 
 
 def chase_frames(view: ChaseView, trajectory: Trajectory) -> np.ndarray:
@@ -48,3 +53,15 @@ def chase_beside_onboard(view: ChaseView, trajectory: Trajectory, gap: int = 8) 
     missing = height - seen.shape[1]
     seen = np.pad(seen, ((0, 0), (missing // 2, missing - missing // 2), (gap, 0), (0, 0)), constant_values=255)
     return np.concatenate((outside, seen), axis=2)
+
+
+def film_from_outside(directory: Path, view: ChaseView, track: Track, trajectory: Trajectory) -> str:
+    """Write a video of the whole flight and a GIF of its second lap, from outside and by the drone; name the files."""
+    frames, words = chase_beside_onboard(view, trajectory), race_words(track, trajectory)
+    view.close()
+    filmed = write_video(directory / "chase.mp4", caption(frames, words), fps=1 / trajectory.control_dt, scale=1)
+    first, last = second_lap(trajectory)
+    shown = slice(first, last + 1, STRIDE)
+    gif = caption(frames[shown], words[shown])
+    size = write_gif(directory / "chase.gif", gif, fps=1 / (STRIDE * trajectory.control_dt), colors=COLORS)
+    return f"{'chase.mp4, ' if filmed else ''}chase.gif ({size / 1e6:.2f} MB)"

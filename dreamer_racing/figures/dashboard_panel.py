@@ -9,7 +9,8 @@ from __future__ import annotations
 import base64
 import io
 import math
-from collections.abc import Callable, Iterator, Sequence
+import shlex
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from html import escape
 from itertools import pairwise
@@ -20,6 +21,7 @@ import numpy as np
 from matplotlib.colors import to_hex
 from PIL import Image
 
+from dreamer_racing.commands import from_here
 from dreamer_racing.envs.drone.parameters import QuadrotorParameters
 from dreamer_racing.envs.tracks import Track
 from dreamer_racing.evaluation.trajectory import Trajectory
@@ -91,6 +93,18 @@ def missing(flight: ShownFlight) -> Iterator[str]:
         yield f"{flight.title}: no images, because none were recorded with the flight."
     if flight.trajectory.value is None:
         yield f"{flight.title}: no value, because the flight has no critic; included agents have none."
+
+
+def how_it_trained(folders: Iterable[Path]) -> str:
+    """Return a line on how to open the training curves of runs in TensorBoard."""
+    # Relative to the working directory if possible, because pages are shown to others.
+    logged = {Path(from_here(folder)): None for folder in folders if (folder / "tensorboard").is_dir()}
+    if not logged:
+        return "Training curves: none, because these flights are in no run directory with TensorBoard files."
+    if len(logged) == 1:
+        return f"Training curves: `tensorboard --logdir {shlex.quote(str(*logged))}`"
+    runs = ",".join(f"{folder.name}:{folder}" for folder in logged)
+    return f"Training curves: `tensorboard --logdir_spec {shlex.quote(runs)}`"
 
 
 def readings(track: Track, flights: Sequence[ShownFlight]) -> dict[str, Any]:

@@ -11,10 +11,12 @@ from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import TypeVar
 
+from dreamer_racing.evaluation.trajectory import NUMBERS
 from dreamer_racing.training.directory import RunDirectory
 
 T = TypeVar("T")
 
+STORED = ("flight", "deterministic")  # prefixes of the files of recipes/fly.py and recipes/evaluate.py
 REASON_LETTERS = 160  # maximum length of the reason why a file cannot be read
 
 
@@ -35,6 +37,14 @@ def evaluation_files(directory: Path, ending: str) -> list[Path]:
     folders = sorted((int(match[1] or 1), folder) for folder, match in number.items() if match)
     after = [RunDirectory(folder).evaluations / f"deterministic{ending}" for _, folder in folders]
     return [*(during[env_steps] for env_steps in sorted(during)), *(file for file in after if file.is_file())]
+
+
+def stored_flights(folder: Path) -> list[Path]:
+    """Return the files of a run's evaluation flights, the latest last; or those in a recipe's output folder."""
+    if evaluated := evaluation_files(folder, NUMBERS):
+        return evaluated
+    places = (folder, RunDirectory(folder).evaluations)
+    return [file for place in places for name in STORED if (file := place / f"{name}{NUMBERS}").is_file()]
 
 
 def evaluation_score(file: Path, ending: str) -> tuple[float, float]:

@@ -30,6 +30,7 @@ CONTEXT_COLOR = (64, 160, 80)  # the model observes the images
 OPEN_LOOP_COLOR = (230, 120, 20)  # the model predicts the images from actions alone
 WHITE = (255, 255, 255)
 MAP_MARGIN = 1.6  # m around the gates of a moving map
+GIF_SIZE = 256  # pixels, least side of either picture of a GIF
 MIN_DELAY = 0.02  # s; browsers show shorter GIF frames much longer
 
 logger = logging.getLogger(__name__)

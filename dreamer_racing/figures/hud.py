@@ -22,6 +22,7 @@ SLOWEST = 8  # maximum factor of slow motion
 STRIP_COLOR, WORDS_COLOR = (33, 37, 41), (255, 255, 255)
 LETTER_SIZES = range(16, 6, -1)  # pixels
 MARGIN = 5  # pixels left and right of the caption
+BEGINNING = 300  # control steps shown if there is no second lap
 SEEN = "seen"
 
 
@@ -48,6 +49,12 @@ def laps_completed(trajectory: Trajectory) -> np.ndarray:
     """
     gate = trajectory.target_gate.numpy()
     return np.concatenate(([0], np.cumsum(gate[1:] < gate[:-1])))
+
+
+def second_lap(trajectory: Trajectory) -> tuple[int, int]:
+    """Return the first and last step of the second lap, flown at racing speed; else of the flight's beginning."""
+    ends = (np.diff(laps_completed(trajectory)).nonzero()[0] + 1).tolist()
+    return (ends[0], ends[1]) if len(ends) > 1 else (0, min(BEGINNING, len(trajectory.action)))
 
 
 def _speed(speed: float) -> str:

@@ -15,7 +15,7 @@ from matplotlib.ticker import MaxNLocator, PercentFormatter
 from dreamer_racing.envs.simulator.scene import Camera
 from dreamer_racing.envs.tracks import Track
 from dreamer_racing.evaluation.evaluate import CRASHES, FINISHED, Episode, Evaluation, Trajectory
-from dreamer_racing.evaluation.protocol import MODES, Result
+from dreamer_racing.evaluation.protocol import CONDITIONS, MODES, PRESETS, Result, report_heading, results_table
 from dreamer_racing.evaluation.sight import BIN_DEGREES, NEAREST_VISIBLE_GATE, Sight, is_race_gate
 from dreamer_racing.figures.drawing import (
     FAINT,
@@ -29,6 +29,7 @@ from dreamer_racing.figures.drawing import (
     speed_scale,
 )
 from dreamer_racing.figures.profiles import draw_altitude
+from dreamer_racing.training.directory import RunDirectory
 
 MODE_COLORS = {"deterministic": "#6f9be0", "stochastic": "#f2b705"}
 CAUSE_COLORS = dict(
@@ -68,6 +69,19 @@ def mean_bar(values: Sequence[float], height: float | None = None) -> Bar:
     n, mean = len(values), float(np.mean(values)) if height is None else height
     half = Z95 * float(np.std(values, ddof=1)) / np.sqrt(n) if n > 1 else 0.0
     return Bar(mean, max(0.0, mean - half), mean + half, n)
+
+
+def write_markdown(directory: Path, results: Sequence[Result], provenance: dict[str, Any]) -> None:
+    """Write evaluation.md, the table of conditions, with its plots."""
+    title = f"{provenance['algorithm']} on {provenance['track']}, {provenance['env_steps']:,} env_steps"
+    plot_conditions(results, RunDirectory(directory).plots / "conditions.png", title)
+    for preset in dict.fromkeys(result.preset for result in results):
+        flown = {r.mode: r.evaluation for r in results if r.preset == preset and r.condition == "nominal"}
+        plot_crashes(flown, RunDirectory(directory).plots / f"crashes_{preset}.png", f"{title}, nominal, {preset}")
+    meanings = "\n".join(f"- `{condition.name}`: {condition.meaning}" for condition in CONDITIONS)
+    plots = "\n\n".join(f"![{name}](plots/{name}.png)" for name in ("conditions", *(f"crashes_{p}" for p in PRESETS)))
+    text = f"{report_heading(title, provenance)}\n{results_table(results)}\n{meanings}\n\n{plots}\n"
+    (directory / "evaluation.md").write_text(text, encoding="utf-8")
 
 
 def plot_conditions(results: Sequence[Result], path: str | Path, title: str | None = None) -> None:

@@ -14,17 +14,27 @@ from torch import Tensor
 from torchrl.envs import EnvBase
 
 from dreamer_racing.envs.policy_memory import with_memory
+from dreamer_racing.envs.tracks import Track
 from dreamer_racing.evaluation.course import Course, act
 from dreamer_racing.evaluation.dreams import Painter, dream, find_painter, record_dream
 from dreamer_racing.evaluation.evaluate import Evaluation, Trajectory, split_episodes
+from dreamer_racing.evaluation.protocol import Result
 from dreamer_racing.evaluation.trajectory import write_flight
-from dreamer_racing.figures.film import enlarge_to_watch, side_by_side, write_video
-from dreamer_racing.figures.hud import caption, dream_words, race_words, slow_motion
+from dreamer_racing.figures.film import (
+    GIF_SIZE,
+    enlarge_to_watch,
+    onboard_beside_map,
+    side_by_side,
+    write_gif,
+    write_video,
+)
+from dreamer_racing.figures.hud import caption, dream_words, race_words, second_lap, slow_motion
 from dreamer_racing.figures.top_down import plot_top_down
 from dreamer_racing.learners.learner import Evaluable
 from dreamer_racing.learners.update import WorldModelLearner
-from dreamer_racing.training.directory import RunDirectory
+from dreamer_racing.training.directory import EVALUATION, RunDirectory
 
+GIF_STRIDE = 2  # control steps a frame: 25 frames a second
 SEEN_STEPS, DREAMT_STEPS = 10, 40  # control steps observed by the model, then predicted open loop, in the video
 
 
@@ -233,3 +243,34 @@ def dream_beside_flight(learner: WorldModelLearner, trajectory: Trajectory, pain
         dreamt = dream(learner, trajectory, painter, [part], seen)[0]
         shown.append(torch.as_tensor(side_by_side(pixels[part], dreamt, seen)))
     return torch.cat(shown)
+
+
+def report_condition(into: RunDirectory, result: Result, video_steps: int) -> None:
+    """Plot the first flight of a condition from above; film it, if it has images and the policy is deterministic."""
+    trajectory = result.evaluation.trajectories[0]
+    plot_top_down(result.track, trajectory, into.plots / f"{result.name}.png")
+    if trajectory.pixels is not None and result.mode == "deterministic":
+        frames = onboard_beside_map(result.track, trajectory.part(0, min(video_steps, len(trajectory.action))))
+        film = caption(frames, race_words(result.track, trajectory)[: len(frames)])
+        write_video(into.videos / f"{result.name}.mp4", film, fps=round(1 / trajectory.control_dt))
+
+
+def report_flight(directory: Path, track: Track, result: Evaluation) -> str:
+    """Write numbers and a plot of a flight, of one with images a video and a GIF of its second lap; name the files."""
+    trajectory = result.trajectories[0]
+    (directory / EVALUATION).write_text(result.to_json())
+    stored = write_flight(directory / "flight", trajectory, track)
+    plot_top_down(track, trajectory, directory / "top_down.png")
+    for earlier in ("onboard.mp4", "onboard.gif", "chase.mp4", "chase.gif"):
+        (directory / earlier).unlink(missing_ok=True)  # so that none is mistaken for this flight's
+    files = f"{EVALUATION}, {', '.join(stored)}, top_down.png"
+    if trajectory.pixels is None:
+        return f"{files} (there is no video: the agent sees numbers)"
+    words = race_words(track, trajectory)
+    film = caption(enlarge_to_watch(trajectory.pixels.numpy()), words)
+    filmed = write_video(directory / "onboard.mp4", film, fps=1 / trajectory.control_dt, scale=1)
+    first, last = second_lap(trajectory)
+    frames = onboard_beside_map(track, trajectory.part(first, last), GIF_SIZE)[::GIF_STRIDE]
+    gif = caption(frames, words[first : last + 1 : GIF_STRIDE])
+    size = write_gif(directory / "onboard.gif", gif, fps=1 / (GIF_STRIDE * trajectory.control_dt))
+    return f"{files}, {'onboard.mp4, ' if filmed else ''}onboard.gif ({size / 1e6:.2f} MB)"

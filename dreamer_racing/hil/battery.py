@@ -8,7 +8,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 from dreamer_racing.settings import ALLOWED, POSITIVE, Range, check_settings, setting
 
@@ -97,8 +97,27 @@ class Battery:
             self.age = now - self._heard_at
         return self.voltage
 
+    def summary(self) -> dict[str, Any]:
+        """Return counts of readings and the age of the last one, s, as JSON values; an age of None: there was none."""
+        age = self.age if math.isfinite(self.age) else None
+        return {"readings": self.readings, "implausible": self.implausible, "last_reading_age_s": age}
+
     def _gain(self, time: float) -> float:
         """Return the low-pass gain, exact for a voltage that is constant from one reading to the next."""
         if self._heard_at is None or self.config.smoothing == 0.0:
             return 1.0
         return -math.expm1(-max(time - self._heard_at, 0.0) / self.config.smoothing)
+
+
+def battery_words(battery: dict[str, Any]) -> str:
+    """Return, in words, the voltage that the thrust map used at the end of a flight, and where it came from.
+
+    Args:
+        battery: ``voltage_set`` and ``voltage``, V, and `Battery.summary`.
+    """
+    if not battery["readings"]:
+        return f"battery: no usable reading; thrust was computed with voltage={battery['voltage_set']:g}"
+    age = battery["last_reading_age_s"]
+    old = f", the last one {age:.1f} s before the end: STALE" if age > STALE else ""
+    left_out = f", {battery['implausible']} implausible ones ignored" if battery["implausible"] else ""
+    return f"battery: {battery['voltage']:.2f} V at the end, from {battery['readings']} readings{left_out}{old}"

@@ -6,9 +6,10 @@ replayed through it: the same file gives the same commands, bit for bit.
 
 from __future__ import annotations
 
+import json
 import math
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -345,6 +346,28 @@ def describe_outputs(outputs: Outputs) -> dict[str, Any]:
         "passes": outputs.passes,
         "voltage": outputs.voltage,
     }
+
+
+def first_difference(chain: FlightChain, ticks: Iterable[dict[str, Any]]) -> str | None:
+    """Pass recorded ticks through a chain; return in words where its outputs first differ, None if nowhere.
+
+    Outputs are compared bit for bit, as JSON values.
+    """
+    for index, tick in enumerate(ticks):
+        again = json.loads(json.dumps(describe_outputs(chain.tick(read_inputs(tick["in"])))))
+        for name, value in tick["out"].items():
+            if not _same(value, again.get(name)):
+                return f"tick {index}: {name} was {value}, and is {again.get(name)} now"
+    return None
+
+
+def _same(one: Any, other: Any) -> bool:
+    """Return whether two JSON values are equal; NaN equals NaN."""
+    if isinstance(one, list) and isinstance(other, list):
+        return len(one) == len(other) and all(map(_same, one, other))
+    if isinstance(one, float) and isinstance(other, float) and math.isnan(one):
+        return math.isnan(other)
+    return one == other
 
 
 def _numbers(packet: PosePacket) -> list[float]:

@@ -15,7 +15,7 @@ from typing import Any, Protocol
 import numpy as np
 
 from dreamer_racing.hil.background_worker import BackgroundWorker
-from dreamer_racing.hil.battery import Reading
+from dreamer_racing.hil.battery import Reading, battery_words
 from dreamer_racing.hil.chain import FlightChain, Inputs, Outputs, describe_inputs, describe_outputs
 from dreamer_racing.hil.operator import Operator, OperatorSource
 from dreamer_racing.hil.pose import PoseSource, Received
@@ -110,6 +110,22 @@ def percentiles(seconds: list[float]) -> dict[str, float] | None:
         return None
     p50, p99, largest = (1e3 * float(value) for value in np.percentile(seconds, (50, 99, 100)))
     return {"p50_ms": p50, "p99_ms": p99, "max_ms": largest}
+
+
+def summary_lines(summary: dict[str, Any]) -> Iterator[str]:
+    """Yield the summary of a flight, as recipes/hil.py writes it, in words."""
+    laps = ", ".join(f"{lap:.2f} s" for lap in summary["laps"]) or "none"
+    yield f"ended: {summary['ended']}"
+    yield f"gates passed: {len(summary['passes'])}, laps, from first gate to first gate: {laps}"
+    for name, row in summary["loop"].items():
+        if isinstance(row, dict):
+            yield f"{name:<9} p50 {row['p50_ms']:6.2f} ms   p99 {row['p99_ms']:6.2f} ms   max {row['max_ms']:6.2f} ms"
+    yield f"ticks: {summary['loop']['ticks']}, overruns: {summary['loop']['overruns']}"
+    rejected, out_of_order = summary["poses"]["rejected"], summary["poses"]["out_of_order"]
+    if rejected or out_of_order:
+        yield f"poses ignored: {rejected} invalid messages, {out_of_order} out of order"
+    if summary["battery"] is not None:
+        yield battery_words(summary["battery"])
 
 
 class FlightLoop:

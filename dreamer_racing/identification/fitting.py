@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import logging
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
@@ -97,6 +97,22 @@ class Fit:
     errors: dict[str, float]
     before: dict[str, float]
     thrust: float | None
+
+    def lines(self, preset: str) -> Iterator[str]:
+        """Yield the fitted parameters, errors and thrust as text; ``preset`` names the initial parameters."""
+        yield f"{'':<10}{'relative':>10}{'±':>8}  (to {preset}; delay in ms, added)"
+        for name, value in self.values.items():
+            scale = 1e3 if name == "delay" else 1.0
+            width = scale * self.deviations[name] * (1.0 if name == "delay" else value)
+            remark = "   poorly determined" if name in self.unknown else ""
+            yield f"{name:<10}{scale * value:>10.3f}{width:>8.3f}{remark}"
+        for axis, error in self.errors.items():
+            before = f"{self.before[axis]:.1%} before"
+            yield f"{axis}: RMS error of body rates {error:.1%} of the commanded rates ({before})"
+        if self.thrust is None:
+            yield "thrust: no force was measured"
+        else:
+            yield f"thrust: {self.thrust:.3f} of the assumed thrust: multiply full_thrust= of recipes/hil.py by it"
 
 
 class Simulated(NamedTuple):

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Callable, Mapping
+from pathlib import Path
 from typing import Any
 
 import torch
@@ -58,6 +59,14 @@ class NonFiniteLossError(RuntimeError):
             "observation is bad."
         )
         self.batch = batch
+
+    def save_batch(self, path: Path) -> str:
+        """Save the batch; return in words where it is, or why it could not be saved."""
+        try:
+            torch.save(self.batch.to("cpu").to_dict(), path)
+        except (OSError, RuntimeError) as refused:  # torch raises RuntimeError on a full disk
+            return f"The batch could not be saved ({' '.join(str(refused).split())})"
+        return f"The batch is saved in {path}"
 
 
 class Flag:

@@ -63,6 +63,15 @@ class PPOConfig:
     gradient_clip: float = setting(0.5, POSITIVE)
     initial_std: float = setting(0.6, POSITIVE)
 
+    def check(self, num_envs: int, rollout_steps: int) -> None:
+        """Refuse more minibatches than a rollout has records."""
+        records = num_envs * rollout_steps
+        if self.minibatches > records:
+            raise ValueError(
+                f"ppo.minibatches={self.minibatches} are more than the {records} records of a rollout, env.num_envs="
+                f"{num_envs} times rollout_steps={rollout_steps}: lower the one, or raise the others."
+            )
+
 
 class PPOLearner(BaselineLearner):
     """Actor and critic with TorchRL's ``ClipPPOLoss``, and one optimiser.

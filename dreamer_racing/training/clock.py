@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import shutil
 import time
 from collections import defaultdict
 from collections.abc import Callable, Iterator, Mapping
@@ -12,6 +13,7 @@ from datetime import timedelta
 from typing import Any
 
 from dreamer_racing.settings import COUNT, NOT_NEGATIVE, setting
+from dreamer_racing.training.directory import RunDirectory
 from dreamer_racing.training.metrics import PendingMetrics
 
 WALL_CLOCK, CPU_CLOCK = "wall_clock", "cpu_clock"
@@ -174,6 +176,17 @@ class CheckpointConfig:
     # minutes of wall-clock time between checkpoints, for preemptible machines; 0: by env_steps alone
     minutes: float = setting(0.0, NOT_NEGATIVE)
     keep: int = setting(2, COUNT)  # number of newest checkpoints kept
+
+    def disk_needed(self, replay: int, directory: RunDirectory) -> str:
+        """Return a line on the peak disk use of checkpoints with a replay of so many bytes, and on the free space."""
+        there = sum(file.stat().st_size for file in directory.checkpoints.rglob("*") if file.is_file())
+        peak, free = (self.keep + 1) * replay, shutil.disk_usage(directory.path).free + there
+        line = (
+            f"disk: at most {peak / 1e9:.1f} GB for the replay in checkpoint.keep={self.keep} checkpoints and the one "
+            f"being written, about a seventh of that for images of races; {free / 1e9:.1f} GB free"
+        )
+        advice = "lower checkpoint.keep= or replay.capacity=, or choose another run_dir=; else saving may fail"
+        return f"{line}: MAY NOT BE ENOUGH, {advice}" if peak > free else line
 
 
 class Periods:

@@ -1,17 +1,19 @@
-"""Graceful end of a run on a signal."""
+"""Graceful end of a run on a signal, also of one that another process started."""
 
 from __future__ import annotations
 
 import contextlib
 import os
 import signal
+import subprocess
 import sys
 import threading
 from collections.abc import Callable
+from pathlib import Path
 from types import FrameType, TracebackType
 from typing import Any
 
-from dreamer_racing.terminal import leave_terminal
+from dreamer_racing.terminal import leave_terminal, say
 
 HANG_UP = getattr(signal, "SIGHUP", None)  # not on Windows
 ENDING = [number for number in (signal.SIGINT, signal.SIGTERM, HANG_UP) if number is not None]
@@ -80,6 +82,43 @@ class GracefulExit:
             self.signal_name = name
         if self._answer:
             self.write(f"{name}: {self._answer}")
+
+
+def run_passing_signals(command: list[str], log: Path) -> int:
+    """Run a training in a process of its own, with its output at the end of a file; return its exit status.
+
+    Signals are passed on as SIGTERM, so that it saves and ends. Then this process ends too, or calls the handler that
+    the signal had before: that of a Slurm job queues the job again.
+    """
+    received: list[signal.Signals] = []
+    passed_on = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGUSR1, signal.SIGUSR2)
+    here = threading.current_thread()  # only the main thread may set handlers
+    before = {number: signal.getsignal(number) for number in passed_on} if here is threading.main_thread() else {}
+    if before.get(signal.SIGHUP) is signal.SIG_IGN:  # nohup
+        del before[signal.SIGHUP]
+    for number in before.keys() & {signal.SIGUSR1, signal.SIGUSR2}:
+        signal.signal(number, signal.SIG_IGN)  # inherited by the training, since Slurm signals every process
+    with (
+        log.open("a", encoding="utf-8") as file,
+        subprocess.Popen(command, stdout=file, stderr=file, start_new_session=True) as process,
+    ):
+
+        def pass_on(number: int, frame: object) -> None:
+            received.append(signal.Signals(number))
+            process.send_signal(signal.SIGTERM)
+
+        for number in before:
+            signal.signal(number, pass_on)
+        status = process.wait()
+    for number, handler in before.items():
+        signal.signal(number, handler)
+    if received:
+        say(f"{log.parent}: interrupted by {received[0].name}")
+        handler = before[received[0]]
+        if received[0] in (signal.SIGUSR1, signal.SIGUSR2) and callable(handler):
+            handler(received[0], None)
+        raise SystemExit(128 + received[0])
+    return status
 
 
 def say_at_once(text: str) -> None:

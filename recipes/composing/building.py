@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import json
 import random
-import shutil
-from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeAlias
@@ -13,7 +11,6 @@ from typing import TYPE_CHECKING, Any, TypeAlias
 import numpy as np
 import torch
 from omegaconf import DictConfig, OmegaConf
-from torch import Tensor
 from torchrl.collectors import Collector
 
 from composing.saved import OBSERVATION_SETTINGS, read_yaml
@@ -33,25 +30,17 @@ from dreamer_racing.envs.policy_memory import with_memory
 from dreamer_racing.envs.race.curriculum import BodyRateCurriculum, RelabelReward
 from dreamer_racing.envs.race.gates import CrashCause
 from dreamer_racing.envs.tracks import BUILTIN_TRACKS, describe_track, load_track
-from dreamer_racing.evaluation.held_out import SEEN as OBSERVED
-from dreamer_racing.evaluation.held_out import held_out_metrics, world_model_metrics
-from dreamer_racing.experience.replay import SequenceReplayConfig, Storage, StreamReplay, make_replay, replay_bytes
+from dreamer_racing.experience.replay import SequenceReplayConfig, StreamReplay, make_replay
+from dreamer_racing.experience.replay_place import choose_place, replay_bytes
 from dreamer_racing.export.agents import existing_agent_path
-from dreamer_racing.export.onnx_actor import CONTRACT, read_contract
-from dreamer_racing.export.shipped_agent import check_env, is_agent, load_networks
+from dreamer_racing.export.shipped_agent import is_agent, load_trained
 from dreamer_racing.figures.report import EvaluationReport, ReturnReport
 from dreamer_racing.learners import NetworkSize, PPOLearner, SACLearner
 from dreamer_racing.learners.dreamer_v3 import DreamerV3
 from dreamer_racing.learners.latent_ppo import LatentPPO
-from dreamer_racing.learners.learner import Evaluable, Learner, Policy
-from dreamer_racing.learners.saved import check_size
+from dreamer_racing.learners.learner import Learner, Policy
 from dreamer_racing.learners.update import WorldModelLearner
 from dreamer_racing.losses import find_targets
-from dreamer_racing.machine import (
-    available_memory,
-    check_fits,
-    check_space,
-)
 from dreamer_racing.modules import Agent, Interface, ModelSize, get_size
 from dreamer_racing.modules.interface import PRIVILEGED
 from dreamer_racing.modules.rssm import LatentFormat
@@ -59,8 +48,7 @@ from dreamer_racing.training.checkpoint import load_state
 from dreamer_racing.training.directory import RunDirectory, latest_checkpoint
 from dreamer_racing.training.episodes import EpisodeTracker
 from dreamer_racing.training.following import NoReport
-from dreamer_racing.training.schedule import ModelLag
-from dreamer_racing.training.session import Evaluator, Session
+from dreamer_racing.training.session import Evaluator
 
 if TYPE_CHECKING:
     from dreamer_racing.envs.control_suite import ControlSuiteEnv
@@ -138,26 +126,17 @@ def make_suite(config: RunConfig, num_envs: int, seed: int, episode_steps: int |
     )
 
 
-def make_evaluator(
-    config: RunConfig,
-    directory: Path,
-    learner: Evaluable,
-    episodes: int,
-    video_steps: int,
-    start_noise: float = 0.0,
-    **options: Any,
-) -> Evaluator:
-    """Make the evaluator for the run's environment; in a race, `options` go to `EvaluationReport`."""
+def make_evaluator(config: RunConfig, directory: Path, learner: Learner) -> Evaluator:
+    """Make the evaluator used during training; processes other than the first get one that does nothing."""
+    if not parallel.is_first():
+        return NoReport()
+    asked = config.evaluation
     if is_race(config):
-        worlds = {**shared_env_arguments(config), "start_noise": start_noise}
-        return EvaluationReport(directory, learner, worlds, episodes, video_steps, **options)
+        worlds = {**shared_env_arguments(config), "start_noise": asked.start_noise}
+        return EvaluationReport(directory, learner, worlds, asked.episodes, asked.video_steps)
     seed = config.seed + 1
-    env = make_suite(config, min(8, episodes), seed)
-    return ReturnReport(directory, learner, env, episodes, video_steps, seed)
-
-
-WINDOWS, RECORDS = 32, 2_000
-"""Held-out windows per measurement, and the newest records of a world that they are drawn from."""
+    env = make_suite(config, min(8, asked.episodes), seed)
+    return ReturnReport(directory, learner, env, asked.episodes, asked.video_steps, seed)
 
 
 def size_of(config: WorldModelRunConfig) -> ModelSize:
@@ -194,13 +173,9 @@ def load_initial_weights(learner: WorldModelLearner, config: WorldModelRunConfig
         if unmatched.initial:
             line += f"; not in that run, so untrained: {' and '.join(unmatched.initial)}"
         return line + (f"; not loaded: {' and '.join(unmatched.unused)}" if unmatched.unused else "")
-    contract = read_contract(folder / CONTRACT)
-    check_size(contract["model"], learner.size)
     if not isinstance(env, DroneRacingEnv):
         raise ValueError(f"init_from={source}: this agent was trained on races, and this run has none.")
-    check_env(folder, contract, env)
-    for agent in filter(None, (learner.agent, learner.averaged)):
-        load_networks(folder, agent)
+    load_trained(folder, env, *filter(None, (learner.agent, learner.averaged)))
     return f"weights: encoder, RSSM and actor of {folder} (init_from=); heads and critic start untrained"
 
 
@@ -224,33 +199,6 @@ def make_learner(
     if isinstance(config, SACRunConfig):
         return SACLearner(NetworkSize(config.network.layers, config.network.units), interface, config.sac, device, seed)
     raise NotImplementedError(f"make_learner() has no branch for {type(config).__name__}: add one.")
-
-
-def measure(
-    session: Session, learner: WorldModelLearner, replay: StreamReplay, scheduled: Mapping[str, float]
-) -> dict[str, Tensor | float]:
-    """Return the current hyperparameters, and the world model's metrics on the newest held-out records."""
-    groups = zip(("world_model", "behavior"), learner.optimizer.param_groups, strict=True)
-    numbers: dict[str, Any] = {f"schedule/{name}": value for name, value in scheduled.items()}
-    numbers |= {f"learning_rate/{name}": group["lr"] for name, group in groups}
-    windows = replay.held_out(WINDOWS, OBSERVED + learner.config.imagination_horizon, RECORDS)
-    if windows is None or not session.counters["updates"]:
-        return numbers
-    with session.undisturbed():
-        return numbers | held_out_metrics(learner, windows)
-
-
-def measure_lag(
-    session: Session, config: WorldModelRunConfig, learner: WorldModelLearner, replay: StreamReplay, lag: ModelLag
-) -> dict[str, Tensor | float]:
-    """Measure the world model's error on the newest records, before it trains on them."""
-    length = config.model.batch_length
-    if config.replay.context:  # windows begin with stored latents: the newest rollout suffices
-        length = min(length, config.rollout_steps)
-    if (windows := replay.newest(length)) is None:
-        return {}
-    with session.undisturbed():
-        return lag.add_fresh_error(parallel.averaged(world_model_metrics(learner, windows)))
 
 
 def seed_generators(seed: int) -> None:
@@ -308,19 +256,11 @@ def make_run_replay(
     numbers = interface.vector_dim + interface.privileged_dim
     image = interface.image_shape if interface.pixels else (0,)
     size = replay_bytes(settings.capacity, image, interface.action_dim, numbers, latents)
-    files = config.run_directory.replay if settings.storage is Storage.memmap else None
-    device = settings.device if files is None else "cpu"
-    if device == "auto":
-        fits = config.device != "cpu" and size < 0.5 * available_memory(config.device)
-        device = config.device if fits else "cpu"
-    if files is not None:
-        shutil.rmtree(files, ignore_errors=True)  # left by a run that was killed
-    check_room(size, settings.capacity, device, files)
-    if files is not None:
-        files.mkdir(parents=True, exist_ok=True)
-    where = f"memory of {device}" if files is None else f"files below {files}, until the process ends"
-    print(f"replay: {settings.capacity:,} records, {size / 1e9:.1f} GB when full, in {where}")
-    print(disk_needed(config, round(size * min(parallel.num_processes(), config.total_env_steps / settings.capacity))))
+    place = choose_place(settings, size, config.device, config.run_directory.replay)
+    place.prepare()
+    print(place)
+    saved = round(size * min(parallel.num_processes(), config.total_env_steps / settings.capacity))
+    print(config.checkpoint.disk_needed(saved, config.run_directory))
     windows = {}
     if isinstance(settings, SequenceReplayConfig):
         windows = {name: getattr(settings, name) for name in ("recent_share", "recent_records", "held_out")}
@@ -329,8 +269,8 @@ def make_run_replay(
         config.env.num_envs,
         *batch,
         config.device,
-        storage_device=device,
-        scratch_dir=files,
+        storage_device=place.device,
+        scratch_dir=place.files,
         seed=config.seed,
         transform=RelabelReward(curriculum) if curriculum.env is not None and config.curriculum.relabel else None,
         observation_keys=interface.replay_keys,
@@ -338,39 +278,9 @@ def make_run_replay(
         reward_keys=["reward", *(name for name in ("reward_base", "body_rate_norm") if name in shown)],
         latents=latents,
         # Prefetched samples would lack the latents that the update before them stores.
-        prefetch=2 if config.device != "cpu" and device == "cpu" and latents is None else None,
+        prefetch=2 if config.device != "cpu" and place.device == "cpu" and latents is None else None,
         **windows,
     )
-
-
-def check_room(size: int, capacity: int, device: str, files: Path | None) -> None:
-    """Refuse replays that do not all fit; each process has one of `size` bytes and `capacity` records."""
-    asked = f"replay.capacity={capacity * parallel.num_processes():,}"
-    if files is not None:
-        check_space(size * parallel.num_processes(), files, asked)
-    else:
-        check_fits(size * parallel.num_local_processes() if device == "cpu" else size, device, asked)
-
-
-def disk_needed(config: ReplayRunConfig, replay: int) -> str:
-    """Return a line on the peak disk use of checkpoints with a replay of `replay` bytes, and on the free space."""
-    directory = config.run_directory
-    there = sum(file.stat().st_size for file in directory.checkpoints.rglob("*") if file.is_file())
-    peak, free = (config.checkpoint.keep + 1) * replay, shutil.disk_usage(directory.path).free + there
-    line = (
-        f"disk: at most {peak / 1e9:.1f} GB for the replay in checkpoint.keep={config.checkpoint.keep} checkpoints and "
-        f"the one being written, about a seventh of that for images of races; {free / 1e9:.1f} GB free"
-    )
-    advice = "lower checkpoint.keep= or replay.capacity=, or choose another run_dir=; else saving may fail"
-    return f"{line}: MAY NOT BE ENOUGH, {advice}" if peak > free else line
-
-
-def make_run_evaluator(config: RunConfig, directory: Path, learner: Learner) -> Evaluator:
-    """Make the evaluator used during training; processes other than the first get one that does nothing."""
-    if not parallel.is_first():
-        return NoReport()
-    asked = config.evaluation
-    return make_evaluator(config, directory, learner, asked.episodes, asked.video_steps, asked.start_noise)
 
 
 def make_tracker(config: RunConfig) -> EpisodeTracker:

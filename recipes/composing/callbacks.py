@@ -28,8 +28,8 @@ class DrawFigures(Callback):
     def on_multirun_end(self, config: DictConfig, **kwargs: Any) -> None:
         """Draw all figures for which there is data; exit with status 1 if a run has failed."""
         # Imported here, because hydra makes this object at the start of every job, and only the end draws.
-        from composing.entry import start_logging
         from dreamer_racing.figures.plotting import PlotConfig, draw
+        from dreamer_racing.terminal import start_logging
 
         start_logging()
 

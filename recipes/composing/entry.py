@@ -1,7 +1,6 @@
 """Entry points: call a recipe's `main` with the configuration that hydra composes, and print errors in plain words."""
 
 import functools
-import logging
 import os
 import re
 import signal
@@ -24,6 +23,7 @@ from composing.messages import INTERRUPTED, is_follower_rank, say_error
 from composing.options import CONFIG_DIR, FLAGS, no_such_setting
 from dreamer_racing.envs.simulator.opengl import RendererUnavailableError
 from dreamer_racing.settings import check_settings, wrong_choice
+from dreamer_racing.terminal import start_logging
 
 
 @contextmanager
@@ -54,20 +54,6 @@ def plain_disk_errors() -> Iterator[None]:
     except OSError as error:
         print(f"error: {error}. The results written so far are incomplete.", file=sys.stderr)
         raise SystemExit(1) from error
-
-
-def start_logging() -> None:
-    """Print the package's log messages on stdout, one line each."""
-    logging.basicConfig(level=logging.WARNING, format="%(message)s", stream=sys.stdout, force=True)
-    logging.getLogger("dreamer_racing").setLevel(logging.INFO)
-    logging.getLogger("torchrl").setLevel(logging.WARNING)
-
-
-def follow_quietly() -> None:
-    """Print nothing but warnings and errors, on stderr, in a process other than the first, which prints the rest."""
-    sys.stdout = Path(os.devnull).open("w", encoding="utf-8")  # noqa: SIM115 - until the process ends
-    logging.basicConfig(level=logging.WARNING, format="%(message)s", stream=sys.stderr, force=True)
-    logging.getLogger("dreamer_racing").setLevel(logging.WARNING)
 
 
 def new_run_dir(recipe: str, track: str) -> Path:
@@ -189,10 +175,7 @@ def to_checked_object(config: DictConfig) -> Any:
 def schema_alone(name: str) -> dict[str, Any]:
     """Return the primary configuration of a recipe without a YAML file: its schema, and no groups."""
     silent = [{f"override hydra/{kind}_logging": "none"} for kind in ("job", "hydra")]
-    return {
-        "defaults": [f"{name}_schema", "_self_", *silent],
-        "hydra": {"output_subdir": None, "run": {"dir": "."}},
-    }
+    return {"defaults": [f"{name}_schema", "_self_", *silent], "hydra": {"output_subdir": None, "run": {"dir": "."}}}
 
 
 def normalise_argument(argument: str) -> str:

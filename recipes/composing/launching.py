@@ -15,15 +15,7 @@ from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig, ListConfig, OmegaConf
 
 from composing.checks import check_overrides, check_read
-from composing.entry import (
-    as_override,
-    follow_quietly,
-    merge_overrides,
-    override_key,
-    override_value,
-    plain_errors,
-    start_logging,
-)
+from composing.entry import as_override, merge_overrides, override_key, override_value, plain_errors
 from composing.options import command
 from composing.resolving import tune
 from composing.saved import (
@@ -42,12 +34,8 @@ from dreamer_racing.export.agents import agent_path
 from dreamer_racing.export.shipped_agent import is_agent
 from dreamer_racing.figures.loggers import RunLogger, make_loggers
 from dreamer_racing.learners.gradient_step import NonFiniteLossError
-from dreamer_racing.machine import (
-    git_commit,
-    is_out_of_memory,
-    keep_freed_memory,
-    out_of_memory_advice,
-)
+from dreamer_racing.machine import git_commit, is_out_of_memory, keep_freed_memory, out_of_memory_advice
+from dreamer_racing.terminal import follow_quietly, start_logging
 from dreamer_racing.training.checkpoint import RunCheckpointError, newest_sound
 from dreamer_racing.training.directory import PREFIX, RunDirectory, env_steps_of, latest_checkpoint, replace_text
 from dreamer_racing.training.following import LockHeldByFirst
@@ -140,7 +128,7 @@ def training_session(config: RunConfig, overrides: list[str], remedy: str) -> It
         kept = session.directory.nonfinite_batch.with_suffix(f".{parallel.rank()}.pt" if parallel.rank() else ".pt")
         raise SystemExit(
             f"error: {error} Update {session.counters['updates']:,}, {session.env_steps:,} env_steps. "
-            f"{save_batch(error, kept)}; {session.last_good}. Continue from there with a lower {remedy}."
+            f"{error.save_batch(kept)}; {session.last_good}. Continue from there with a lower {remedy}."
         ) from error
     except OSError as error:  # failed writes are tolerated during the run, but not at its end
         raise SystemExit(f"error: {error}. The run is not finished: {session.last_good}.") from error
@@ -201,15 +189,6 @@ def print_thread_error(failure: threading.ExceptHookArgs) -> None:
         print(f"error in {failure.thread.name if failure.thread else 'a thread'}: {failure.exc_value}", file=sys.stderr)
     else:
         threading.__excepthook__(failure)
-
-
-def save_batch(error: NonFiniteLossError, path: Path) -> str:
-    """Save the batch whose loss was not finite; return where it is, or why it could not be saved."""
-    try:
-        torch.save(error.batch.to("cpu").to_dict(), path)
-    except (OSError, RuntimeError) as refused:  # torch raises RuntimeError on a full disk
-        return f"The batch could not be saved ({' '.join(str(refused).split())})"
-    return f"The batch is saved in {path}"
 
 
 def resumed_config(algorithm: str, resume: str, overrides: list[str]) -> tuple[DictConfig, list[str]]:

@@ -55,15 +55,9 @@ class Option(NamedTuple):
 
 
 @cache
-def all_options() -> dict[str, list[Option]]:
-    """Return the options of all recipes, by the recipes' names."""
-    read = json.loads(OPTIONS.read_text(encoding="utf-8"))
-    return {recipe: [Option(*fields) for fields in rows] for recipe, rows in read.items()}
-
-
 def options(recipe: str) -> list[Option]:
     """Return all options of a recipe."""
-    return all_options()[recipe]
+    return [Option(*fields) for fields in json.loads(OPTIONS.read_text(encoding="utf-8"))[recipe]]
 
 
 def groups(recipe: str) -> dict[str, list[str]]:

@@ -16,23 +16,24 @@ from dreamer_racing.devices import choose_device
 from dreamer_racing.envs.torchrl_env import DroneRacingEnv
 from dreamer_racing.envs.tracks import hash_track
 from dreamer_racing.export.actor_step import ActorStep
-from dreamer_racing.export.agents import agent_path, agents_that_ship
 from dreamer_racing.export.contract import hash_weights
 from dreamer_racing.export.shipped_agent import (
     AVERAGED,
     TRAINED,
     ShippedAgent,
     choose_weights,
+    config_folder,
+    find_trained,
     is_agent,
     kept_weights,
+    results_of,
 )
 from dreamer_racing.learners.learner import Evaluable, Learner
 from dreamer_racing.learners.update import WorldModelLearner
 from dreamer_racing.machine import command_line, provenance
 from dreamer_racing.modules import Interface
 from dreamer_racing.settings import COUNT, SEED, setting
-from dreamer_racing.training.checkpoint import load_components, load_state, newest_sound
-from dreamer_racing.training.directory import RunDirectory
+from dreamer_racing.training.checkpoint import load_components, load_state
 from dreamer_racing.training.schedule import Schedule
 
 
@@ -141,44 +142,6 @@ def restore(config: FlightConfig) -> Restored:
     print(f"checkpoint: {checkpoint} ({trained.algorithm}, trained on {trained_on}, {env_steps:,} env_steps)")
     print(f"weights: {weights}{' (weights=auto)' if config.weights == 'auto' else ''}")
     return Restored(checkpoint, trained, trained_on, flyer, weights, env_steps, machine, started)
-
-
-def find_trained(name: str) -> Path:
-    """Find the agent or checkpoint that `checkpoint=` or `agent=` names.
-
-    Args:
-        name: of an included agent; or path of an agent's folder, a run directory, or a checkpoint.
-
-    Returns:
-        The folder of the agent, or the newest checkpoint there.
-
-    Raises:
-        FileNotFoundError: there is neither; the message names the included agents.
-    """
-    path = agent_path(name)
-    if is_agent(path):
-        return path.absolute()
-    try:
-        return newest_sound(name, ("learner", "counters"))
-    except FileNotFoundError as error:
-        raise FileNotFoundError(f"{error} {agents_that_ship()}") from error
-
-
-def config_folder(checkpoint: Path) -> Path:
-    """Return the folder that holds the configuration of a checkpoint or an agent."""
-    return checkpoint if is_agent(checkpoint) else RunDirectory.of(checkpoint).path
-
-
-def results_of(checkpoint: Path) -> Path:
-    """Return the folder for results of a checkpoint or an agent."""
-    return Path("runs") / f"agent_{checkpoint.name}" if is_agent(checkpoint) else RunDirectory.of(checkpoint).path
-
-
-def report_heading(title: str, provenance: dict[str, Any]) -> str:
-    """Return the head of a Markdown report: the title, the command, and where the numbers come from."""
-    facts = {name: value for name, value in provenance.items() if name != "command" and value is not None}
-    text = "; ".join(f"{name.replace('_', ' ')} {value}" for name, value in facts.items())
-    return f"# {title}\n\n```bash\n{provenance['command']}\n```\n\n{text}.\n"
 
 
 def restore_learner(

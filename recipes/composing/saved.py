@@ -13,14 +13,7 @@ from dreamer_racing.figures.runs import flatten
 from dreamer_racing.settings import shortened
 from dreamer_racing.training.directory import RunDirectory
 
-MACHINE_SETTINGS = (
-    "device",
-    "env.renderer",
-    "model.mixed_precision",
-    "model.cuda_graph",
-    "resume",
-    "run_dir",
-)
+MACHINE_SETTINGS = ("device", "env.renderer", "model.mixed_precision", "model.cuda_graph", "resume", "run_dir")
 """Settings that a resumed run chooses anew, unless they were given when it began."""
 OBSERVATION_SETTINGS = ("env.control_rate", "env.camera_rate", "env.camera_tilt", "env.imu", "env.vector")
 """Settings that define an agent's observations and their rate; its networks fit no others."""

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any, ClassVar
 
 from hydra.core.config_store import ConfigStore
-from omegaconf import MISSING
+from omegaconf import MISSING, DictConfig
 
 from dreamer_racing import parallel
 from dreamer_racing.envs.config import EnvConfig
@@ -130,11 +130,8 @@ class RunConfig:
             StartSampler(track, start_noise=noise)
         except ValueError as error:
             raise ValueError(f"evaluation.{error}") from error
-        if env.start_on_line == 1 and env.start_beyond_gate and not self.schedules_start_on_line:
-            raise ValueError(
-                f"env.start_beyond_gate={env.start_beyond_gate:g} is a share of the episodes that do not begin on the "
-                "racing line, and env.start_on_line=1 leaves none: lower that, or set env.start_beyond_gate=0."
-            )
+        if not self.schedules_start_on_line:
+            env.check_shares()
 
 
 @dataclass
@@ -241,10 +238,7 @@ class WorldModelRunConfig(ReplayRunConfig):
         """Refuse worker settings without collector=ray, several learners with it, and unequal shares of the worlds."""
         workers, num_envs, asked = self.num_workers, self.env.num_envs, self.workers
         if self.collector is not CollectorKind.ray:
-            default = vars(WorkersConfig())
-            given = [] if workers is None else [f"num_workers={workers}"]
-            given += [f"workers.{name}={value}" for name, value in vars(asked).items() if value != default[name]]
-            if given:
+            if given := worker_settings(self):
                 raise ValueError(f"{given[0]} is for collector=ray: add that, or leave it out.")
             return
         assert workers is not None, "resolve_workers() sets it"
@@ -294,6 +288,13 @@ class LatentPPORunConfig(WorldModelRunConfig):
         """Configurations whose settings the schedule changes, by their dotted names."""
         return super().scheduled | {"loss.ppo": self.loss.ppo}
 
+    @property
+    def newest_records(self) -> int:
+        """Records of each world on which the model's error decides whether the actor waits."""
+        length = self.model.batch_length
+        # Windows that begin with stored latents: the newest rollout suffices.
+        return min(length, self.rollout_steps) if self.replay.context else length
+
     def check(self) -> None:
         """Check as `WorldModelRunConfig.check`, and refuse objectives of imagined steps."""
         super().check()
@@ -321,13 +322,7 @@ class PPORunConfig(RunConfig):
     def check(self) -> None:
         """Check as `RunConfig.check`, and refuse more minibatches than a rollout has records."""
         super().check()
-        records = self.env.num_envs * self.rollout_steps
-        if self.ppo.minibatches > records:
-            raise ValueError(
-                f"ppo.minibatches={self.ppo.minibatches} are more than the {records} records of a rollout, "
-                f"env.num_envs={self.env.num_envs} times rollout_steps={self.rollout_steps}: lower the one, or "
-                "raise the others."
-            )
+        self.ppo.check(self.env.num_envs, self.rollout_steps)
 
 
 @dataclass
@@ -351,6 +346,13 @@ RECIPES: dict[str, type[RunConfig]] = {
     schema.algorithm: schema for schema in (DreamerV3RunConfig, LatentPPORunConfig, PPORunConfig, SACRunConfig)
 }
 """Configuration classes by algorithm, which is also the name of its file in recipes/ and recipes/config/."""
+
+
+def worker_settings(config: WorldModelRunConfig | DictConfig) -> list[str]:
+    """Return the settings of workers that differ from their defaults, as NAME=VALUE."""
+    chosen = {name: (getattr(config.workers, name), default) for name, default in vars(WorkersConfig()).items()}
+    given = [] if config.num_workers is None else [f"num_workers={config.num_workers}"]
+    return given + [f"workers.{name}={value}" for name, (value, default) in chosen.items() if value != default]
 
 
 def is_race(config: RunConfig) -> bool:

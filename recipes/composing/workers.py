@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import copy
-import os
 from functools import partial
 from typing import cast
 
@@ -12,7 +11,7 @@ from omegaconf import DictConfig, OmegaConf
 from torchrl.envs import TensorDictPrimer, TransformedEnv
 
 from composing.building import Environment, make_agent, make_collector, make_env, worlds_device
-from composing.schema import CollectorKind, LatentPPORunConfig, WorldModelRunConfig, is_race
+from composing.schema import CollectorKind, LatentPPORunConfig, WorldModelRunConfig, is_race, worker_settings
 from dreamer_racing import parallel
 from dreamer_racing.envs.policy_memory import with_memory
 from dreamer_racing.experience import ray_cluster
@@ -40,7 +39,7 @@ def share_of(config: WorldModelRunConfig) -> WorldModelRunConfig:
     processes = parallel.num_processes()
     if processes == 1:
         return config
-    check_devices(config)
+    parallel.check_devices({"device": config.device, "env.device": config.env.device})
     if not isinstance(config, LatentPPORunConfig) and config.model.cuda_graph:
         raise ValueError(
             f"model.cuda_graph=true: {config.algorithm} exchanges imagined returns between {processes} processes "
@@ -66,33 +65,10 @@ def share_of(config: WorldModelRunConfig) -> WorldModelRunConfig:
         )
     own.replay.held_out = config.replay.held_out if parallel.is_first() else 0
     own.seed = (config.seed + parallel.rank() * SEEDS_APART) % 2**32
-    own.device, own.env.device = (_own_device(device) for device in (config.device, config.env.device))
+    own.device, own.env.device = (parallel.own_device(device) for device in (config.device, config.env.device))
     print(f"processes: {processes}, each with {own.env.num_envs} worlds and {own.model.batch_size} windows of a batch;")
     print(f"  process r uses seed {config.seed} + {SEEDS_APART:,} r")
     return own
-
-
-def check_devices(config: WorldModelRunConfig) -> None:
-    """Refuse more processes than this machine has CUDA devices, and the same device for all of them."""
-    here, there = parallel.num_local_processes(), torch.cuda.device_count()
-    for name, device in (("device", config.device), ("env.device", config.env.device)):
-        if not device.startswith("cuda"):
-            continue
-        if ":" in device:
-            raise ValueError(
-                f"{name}={device} would put all {parallel.num_processes()} processes on one device: with {name}=cuda "
-                "each gets its own; CUDA_VISIBLE_DEVICES selects them."
-            )
-        if here > there:
-            raise ValueError(
-                f"{name}={device} needs a CUDA device for each of the {here} processes on this machine, which has "
-                f"{there}: start torchrun with --nproc-per-node={max(there, 1)}, or set {name}=cpu."
-            )
-
-
-def _own_device(device: str) -> str:
-    """Return this process's own device of the given type."""
-    return f"cuda:{os.environ['LOCAL_RANK']}" if device.startswith("cuda") else device
 
 
 NUM_WORKERS = 2
@@ -105,12 +81,9 @@ def resolve_workers(config: DictConfig) -> None:
     if config.collector is CollectorKind.ray:
         config.num_workers = NUM_WORKERS if config.num_workers is None else config.num_workers
     elif config.resume:
-        default = OmegaConf.structured(ray_cluster.WorkersConfig)
-        left_out = [] if config.num_workers is None else [f"num_workers={config.num_workers}"]
-        left_out += [f"workers.{name}={value}" for name, value in config.workers.items() if value != default[name]]
-        if left_out:
+        if left_out := worker_settings(config):
             print(f"workers: none (collector={config.collector.value}); ignored: {', '.join(left_out)}")
-        config.num_workers, config.workers = None, default
+        config.num_workers, config.workers = None, OmegaConf.structured(ray_cluster.WorkersConfig)
 
 
 def make_own_env(config: WorldModelRunConfig) -> Environment:

@@ -13,7 +13,8 @@ from torchrl.collectors import Collector
 from torchrl.data import Binary, Bounded, Composite, Unbounded
 from torchrl.envs import EnvBase, InitTracker, TransformedEnv
 
-from dreamer_racing.experience.replay import make_replay, replay_bytes
+from dreamer_racing.experience.replay import make_replay
+from dreamer_racing.experience.replay_place import replay_bytes
 from dreamer_racing.experience.streams import records_from_rollout
 from dreamer_racing.learners.launches import launches
 from dreamer_racing.modules.rssm import LatentFormat

@@ -103,7 +103,7 @@ def test_worlds_to_train_and_to_be_evaluated_in_are_where_the_learner_is(
     if config.env.suite == "race":
         made = []
         monkeypatch.setattr(arena, "EvaluationReport", lambda *arguments, **options: made.append(arguments[2]))
-        arena.make_evaluator(OmegaConf.to_object(config), Path(), None, 1, 1)
+        arena.make_evaluator(OmegaConf.to_object(config), Path(), None)
         assert made[0]["device"] == expected
 
 

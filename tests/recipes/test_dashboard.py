@@ -43,7 +43,7 @@ def test_a_run_is_its_last_evaluation_of_the_deterministic_policy(runs: Path) ->
     (source,) = dashboard.find(config(run="runs/a"))
     assert (source.flight.title, source.folder, source.track.name) == ("a, 2,000 env_steps", runs / "a", "circle")
     assert source.flight.trajectory.pixels is not None and source.flight.trajectory.value is not None
-    assert dashboard.how_it_trained([source]) == "Training curves: `tensorboard --logdir runs/a`"
+    assert dashboard.how_it_trained([source.folder]) == "Training curves: `tensorboard --logdir runs/a`"
 
 
 def test_folders_and_files_of_other_recipes_are_read_too(runs: Path) -> None:
@@ -60,7 +60,7 @@ def test_folders_and_files_of_other_recipes_are_read_too(runs: Path) -> None:
         assert source.flight.title == title
     assert source.folder == runs / "a"
     (source,) = dashboard.find(config(run="runs/fly"))
-    assert "no run directory" in dashboard.how_it_trained([source])
+    assert "no run directory" in dashboard.how_it_trained([source.folder])
 
 
 def test_agents_that_ship_go_by_their_names(runs: Path) -> None:

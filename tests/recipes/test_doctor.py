@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from dreamer_racing import doctor
-from dreamer_racing.experience.replay import replay_bytes
+from dreamer_racing.experience.replay_place import replay_bytes
 from dreamer_racing.modules import SIZES
 from tests.running_recipes import compose, recipe, recipe_module
 

@@ -221,7 +221,7 @@ SETTINGS = [
 def test_the_actor_waits_while_the_newest_records_are_not_known(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    latent_ppo, measuring = recipe_module("latent_ppo"), recipe_module("composing.building")
+    latent_ppo = recipe_module("latent_ppo")
     config, session = open_session(
         *SETTINGS, f"run_dir={tmp_path}", f"total_env_steps={32 * (12 + MEDIAN_WINDOW)}", name="latent_ppo"
     )
@@ -244,7 +244,7 @@ def test_the_actor_waits_while_the_newest_records_are_not_known(
         assert self.actor_waits is session.parts["lag"].waits
         return metrics
 
-    monkeypatch.setattr(measuring, "world_model_metrics", measure)
+    monkeypatch.setattr("dreamer_racing.evaluation.held_out.world_model_metrics", measure)
     monkeypatch.setattr(latent_ppo.LatentPPO, "update", watched)
     latent_ppo.train(config, session)
     session.close()

@@ -9,8 +9,9 @@ import pytest
 
 from dreamer_racing.envs.tracks import load_track
 from dreamer_racing.hil import configuration as flights
+from dreamer_racing.hil.battery import battery_words
 from dreamer_racing.hil.betaflight import print_settings
-from dreamer_racing.hil.chain import describe_inputs, describe_outputs
+from dreamer_racing.hil.chain import describe_inputs, describe_outputs, read_inputs
 from dreamer_racing.hil.links.udp import decode_command
 from dreamer_racing.hil.recording import FILE, Flight, FlightRecorder
 from tests.running_recipes import ROOT, free_port, recipe, recipe_module
@@ -202,7 +203,7 @@ def test_what_is_believed_of_a_battery_must_be_what_can_be_reckoned_with():
 )
 def test_battery_readings_are_reported(changes, words):
     battery = {"voltage_set": 15.8, "voltage": 15.12, "readings": 9, "implausible": 0, "last_reading_age_s": 0.1}
-    assert hil.in_words(battery | changes) == f"battery: {words}"
+    assert battery_words(battery | changes) == f"battery: {words}"
 
 
 BROKEN = """
@@ -246,7 +247,7 @@ def test_a_flight_depends_on_no_file_of_its_track(tmp_path, capsys):
         flight = hil.prepare(config, opened)
         pose = [10.0, 0, 0.0, 4, -2.5, 1.35, 1, 0, 0, 0, *[0] * 6]
         for tick in range(3):
-            inputs = hil.read_inputs(
+            inputs = read_inputs(
                 {"time": 10.0 + 0.02 * tick, "received": [pose][tick:], "operator": [False] * 2, "overrun": False}
             )
             message = {"in": describe_inputs(inputs), "out": describe_outputs(flight.chain.tick(inputs))}
@@ -276,7 +277,7 @@ def test_a_flight_of_old_is_not_lifted_when_it_is_played_back(tmp_path):
             now = 10.0 + 0.04 * count
             pose = [4, -2.5, 1.35, turned, 0, 0, turned, *[0] * 6]
             message = {"received": [[now, count, now, *pose]], "operator": [count > 8, False], "overrun": 0}
-            inputs = hil.read_inputs({"time": now, **message})
+            inputs = read_inputs({"time": now, **message})
             outputs = chain.tick(inputs)
             armed += outputs.verdict.command.armed
             recorder.tick(now, {"in": describe_inputs(inputs), "out": describe_outputs(outputs)})
@@ -294,7 +295,7 @@ def test_a_replay_says_at_which_tick_it_parts(tmp_path, capsys):
         FlightRecorder(tmp_path / "wrong" / FILE, about) as wrong,
     ):
         for index in range(5):
-            inputs = hil.read_inputs(
+            inputs = read_inputs(
                 {
                     "time": 10.0 + 0.04 * index,
                     "received": [[10.0 + 0.04 * index, index, 0.04 * index, 4, -2.5, 1.35, 1, 0, 0, 0, *[0] * 6]],

@@ -6,6 +6,7 @@ import json
 import math
 import signal
 import time
+from functools import partial
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -17,7 +18,7 @@ from dreamer_racing.envs.control_suite import ControlSuiteEnv
 from dreamer_racing.envs.simulator.opengl import RendererUnavailableError
 from dreamer_racing.modules import Interface
 from dreamer_racing.training.checkpoint import newest_sound
-from dreamer_racing.training.directory import env_steps_of, latest_checkpoint
+from dreamer_racing.training.directory import RunDirectory, env_steps_of, latest_checkpoint
 from tests.running_recipes import (
     AT_THE_END,
     TINY,
@@ -144,17 +145,16 @@ def test_a_disk_that_may_not_be_enough_is_said_before_the_run(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """Three replays are there at the peak, with checkpoint.keep=2; what a run's own checkpoints take is free for it."""
-    building = recipe_module("composing.building")
     composed = recipe_module("dreamer_v3").resolve(compose("dreamer_v3", f"run_dir={tmp_path}", "checkpoint.keep=2"))
-    config = OmegaConf.to_object(composed)
+    needed = partial(OmegaConf.to_object(composed).checkpoint.disk_needed, 1000, RunDirectory(tmp_path))
     free = SimpleNamespace(free=3000)
-    monkeypatch.setattr(building.shutil, "disk_usage", lambda path: free)
-    assert "MAY NOT BE ENOUGH" not in building.disk_needed(config, 1000)
+    monkeypatch.setattr("shutil.disk_usage", lambda path: free)
+    assert "MAY NOT BE ENOUGH" not in needed()
     free.free = 2999
-    assert "MAY NOT BE ENOUGH, lower checkpoint.keep= or replay.capacity=" in building.disk_needed(config, 1000)
+    assert "MAY NOT BE ENOUGH, lower checkpoint.keep= or replay.capacity=" in needed()
     (tmp_path / "checkpoints").mkdir()
     (tmp_path / "checkpoints" / "one").write_bytes(b"x")
-    assert "MAY NOT BE ENOUGH" not in building.disk_needed(config, 1000)
+    assert "MAY NOT BE ENOUGH" not in needed()
     build(*TINY, f"run_dir={tmp_path / 'run'}")
     assert "0.0 GB free: MAY NOT BE ENOUGH" in capsys.readouterr().out
 
@@ -263,7 +263,7 @@ def test_control_rate_line_starts_and_noise_reach_training_and_evaluation(tmp_pa
     assert (env.worlds._starts._on_line, env.worlds.race._sweep._miss_radius) == (0.5, 2)
     learner = recipe_module("composing.building").make_learner(config, Interface.of(env), "cpu")
     env.close()
-    report = arena.make_evaluator(config, tmp_path, learner, 3, 20, config.evaluation.start_noise)
+    report = arena.make_evaluator(config, tmp_path, learner)
     assert report._course.base.worlds.parameters.control_dt == 0.04
     assert report._course.base.worlds.race._sweep._miss_radius == 0
     assert report._course.base.worlds.num_envs == 3, "all begin at once, so that every agent meets the same starts"

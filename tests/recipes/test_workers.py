@@ -15,6 +15,7 @@ from omegaconf import OmegaConf
 
 from dreamer_racing import parallel
 from dreamer_racing.experience.ray_rollouts import RayRollouts, WorkerError
+from dreamer_racing.experience.replay_place import ReplayPlace
 from dreamer_racing.training.directory import latest_checkpoint
 from tests.running_recipes import ROOT, TINY, compose, open_session, recipe, recipe_module, rows
 
@@ -165,16 +166,16 @@ def test_shares_add_up_to_the_run(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def test_replays_of_all_processes_must_fit_together(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    building, machine = recipe_module("composing.building"), sys.modules["dreamer_racing.machine"]
-    monkeypatch.setattr(machine, "available_memory", lambda device: 3_000_000_000)
-    building.check_room(1_000_000_000, 500, "cpu", None)
+    monkeypatch.setattr("dreamer_racing.machine.available_memory", lambda device: 3_000_000_000)
+    on_cpu = ReplayPlace(500, 1_000_000_000, "cpu", None)
+    on_cpu.prepare()
     monkeypatch.setattr(parallel._here, "processes", 4)
     monkeypatch.setenv("LOCAL_WORLD_SIZE", "4")
     with pytest.raises(ValueError, match=r"replay.capacity=2,000 needs 4.0 GB when full, and cpu has 3.0 GB left"):
-        building.check_room(1_000_000_000, 500, "cpu", None)
-    building.check_room(1_000_000_000, 500, "cuda", None)  # each has a device of its own
+        on_cpu.prepare()
+    on_cpu._replace(device="cuda").prepare()  # each has a device of its own
     monkeypatch.setenv("LOCAL_WORLD_SIZE", "2")
-    building.check_room(1_000_000_000, 500, "cpu", None)  # the others are on another machine
+    on_cpu.prepare()  # the others are on another machine
 
 
 @pytest.mark.parametrize(

@@ -9,11 +9,12 @@ project's choice.
 """
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import torch
 from tensordict import TensorDictBase
-from tensordict.nn import TensorDictModuleBase
+from tensordict.nn import TensorDictModule, TensorDictModuleBase
 from torch import Tensor
 
 from dreamer_racing.envs.drone.parameters import GRAVITY, QuadrotorParameters, load_preset, without_randomisation
@@ -286,3 +287,16 @@ class PilotPolicy(TensorDictModuleBase):
         position, attitude, velocity, rates, gate = (tensordict.get(key) for key in self.in_keys)
         action = self.pilot.act(position, attitude, velocity, rates, gate.squeeze(-1))
         return tensordict.set("action", action.to(position))
+
+
+def _hover(track: Track, parameters: QuadrotorParameters) -> TensorDictModuleBase:
+    """Make the pilot that stays at the start."""
+    still = torch.tensor([parameters.hover_action, 0.0, 0.0, 0.0])
+    return TensorDictModule(lambda position: still.repeat(len(position), 1), [("privileged", "position")], ["action"])
+
+
+PILOTS: dict[str, Callable[[Track, QuadrotorParameters], TensorDictModuleBase]] = {
+    "scripted": lambda track, parameters: PilotPolicy(ScriptedPilot(track, parameters)),
+    "hover": _hover,
+}
+"""Factories of policies that fly by the true state, given the track and the drone's parameters."""
