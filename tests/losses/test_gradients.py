@@ -210,14 +210,6 @@ def test_frozen_restores_flags_after_an_error():
     assert all(parameter.requires_grad for parameter in module.parameters())
 
 
-def test_actor_through_the_dynamics_leaves_the_flags_as_they_were():
-    learner = make_learner(actor="dynamics")
-    before = trainable(learner.agent)
-    assert "world_model.rssm.initial_belief" not in before
-    learner.update(make_batch())
-    assert trainable(learner.agent) == before
-
-
 @pytest.mark.parametrize("recurrence", ["dense", "block", "ssm"])
 def test_gradients_of_an_unroll_are_those_of_its_steps(recurrence, monkeypatch):
     """Also across a reset, and with the same samples."""
