@@ -122,12 +122,6 @@ def test_lap_times():
     assert times == [0.0, 0.0, 0.0, pytest.approx(0.12)]  # two hovering and four passing
 
 
-def test_control_dt_scales_lap_times():
-    race = begin(control_dt=0.05)
-    times = [fly(race, *through(gate)).lap_time.item() for gate in range(4)]
-    assert times[-1] == pytest.approx(0.2)
-
-
 def test_a_lap_may_begin_at_any_gate():
     race = begin(target=2)
     times = [fly(race, *through(gate)).lap_time.item() for gate in (2, 3, 0, 1)]
