@@ -65,7 +65,7 @@ def test_a_kill_behind_the_last_checkpoint_costs_nothing_and_adds_nothing(run_di
     shutil.copytree(run_dir, killed)
     (killed / "finished.json").unlink()
     before = (killed / "metrics.csv").read_text()
-    done = recipe("dreamer_v3", f"resume={killed}", cwd=tmp_path)
+    done = recipe("dreamer_v3", f"resume={killed}", cwd=tmp_path, before=UNDRAWN)
     assert done.returncode == 0, done.stderr
     assert (killed / "finished.json").exists()
     assert (killed / "metrics.csv").read_text() == before
@@ -212,7 +212,7 @@ def test_the_full_protocol(run_dir: Path, tmp_path: Path) -> None:
 
 @pytest.mark.slow
 def test_the_perception_report(run_dir: Path, tmp_path: Path) -> None:
-    options = ["episodes=2", "num_envs=2", "run_dir=seen"]
+    options = ["episodes=1", "num_envs=1", "run_dir=seen"]
     done = recipe("perception", f"checkpoint='{run_dir}'", "track=figure8", *options, cwd=tmp_path)
     assert done.returncode == 0, done.stderr
     report = json.loads((tmp_path / "seen" / "perception.json").read_text())
