@@ -169,10 +169,7 @@ def test_embedding_is_a_fixed_target_of_the_decoder_free_loss():
     assert untouched(world_model.reward_head)
 
 
-@pytest.mark.parametrize(
-    ("name", "own"),
-    [("privileged", "State"), ("informed", "State"), ("decoder_free", "Barlow")],
-)
+@pytest.mark.parametrize(("name", "own"), [("privileged", "State"), ("informed", "State"), ("decoder_free", "Barlow")])
 def test_parameters_of_a_loss_are_trained_and_saved(name, own):
     learner = make_learner(world_model=name)
     shared = set(map(id, learner.agent.parameters()))

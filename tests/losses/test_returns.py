@@ -81,13 +81,7 @@ def test_nothing_follows_a_terminated_record():
 def test_a_truncated_record_bootstraps_from_its_own_value(truncated):
     """Also where only the following ``is_init`` tells that the stream was cut."""
     returns, weight = replay_return(
-        numbers(9, 1, 0, 3),
-        numbers(10, 20, 30, 40),
-        flags(0, 0, 1, 0),
-        NEVER,
-        truncated,
-        discount=0.5,
-        lambda_=0.5,
+        numbers(9, 1, 0, 3), numbers(10, 20, 30, 40), flags(0, 0, 1, 0), NEVER, truncated, discount=0.5, lambda_=0.5
     )
     torch.testing.assert_close(returns, numbers(1 + 0.5 * 20, 20.0, 23.0, 40.0))
     assert torch.equal(weight, numbers(1, 0, 1, 0))

@@ -18,17 +18,7 @@ from dreamer_racing.envs.simulator.opengl import RendererUnavailableError
 from dreamer_racing.modules import Interface
 from dreamer_racing.training.checkpoint import newest_sound
 from dreamer_racing.training.directory import env_steps_of, latest_checkpoint
-from tests.running_recipes import (
-    AT_THE_END,
-    TINY,
-    UNDRAWN,
-    build,
-    compose,
-    recipe,
-    recipe_module,
-    rows,
-    started,
-)
+from tests.running_recipes import AT_THE_END, TINY, UNDRAWN, build, compose, recipe, recipe_module, rows, started
 
 SLOW_DISK = """
 import pathlib, time

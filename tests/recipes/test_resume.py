@@ -114,10 +114,7 @@ RACE = [
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "tuned"),
-    [
-        ("dreamer_v3", ["tuned=none"]),
-        ("latent_ppo", [*RACE, "loss.ppo.steps=128", "model=ssm_debug"]),
-    ],
+    [("dreamer_v3", ["tuned=none"]), ("latent_ppo", [*RACE, "loss.ppo.steps=128", "model=ssm_debug"])],
     ids=["none", "race in a state-space model"],
 )
 def test_a_resumed_run_equals_an_uninterrupted_one(name: str, tuned: list[str], tmp_path: Path) -> None:

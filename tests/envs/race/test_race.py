@@ -39,9 +39,7 @@ def fly(race: Race, *points, rates=(0.0, 0.0, 0.0), invalid: bool = False) -> Ra
     path = torch.stack([torch.as_tensor(point, dtype=torch.float64) for point in points])
     path = path.unsqueeze(1).repeat(1, num_envs, 1)
     return race.step(
-        path,
-        torch.tensor(rates, dtype=torch.float64).repeat(num_envs, 1),
-        torch.full((num_envs,), invalid),
+        path, torch.tensor(rates, dtype=torch.float64).repeat(num_envs, 1), torch.full((num_envs,), invalid)
     )
 
 
