@@ -4,7 +4,7 @@ import gymnasium
 import numpy as np
 import pytest
 
-import dreamer_racing
+from dreamer_racing import GYM_ENVIRONMENTS
 from dreamer_racing.envs.drone.parameters import QuadrotorParameters
 from dreamer_racing.envs.race.gates import CrashCause
 
@@ -29,7 +29,7 @@ def vec_env(num_envs: int = 3, observation: str = "vector", **arguments) -> Dron
 
 @pytest.mark.parametrize(
     ("name", "observation"),
-    [*(("Circle", each) for each in POLICIES), *((each, "vector") for each in dreamer_racing.GYM_ENVIRONMENTS)],
+    [*(("Kidney", each) for each in POLICIES if each != "vector"), *((name, "vector") for name in GYM_ENVIRONMENTS)],
 )
 @pytest.mark.filterwarnings("error")
 def test_checker_finds_nothing(name: str, observation: str) -> None:
@@ -38,7 +38,7 @@ def test_checker_finds_nothing(name: str, observation: str) -> None:
     env.close()
 
 
-@pytest.mark.parametrize("observation", POLICIES)
+@pytest.mark.parametrize("observation", [each for each in POLICIES if each != "state"])  # which "both" has, too
 def test_every_observation_trains(observation: str) -> None:
     env = VecMonitor(vec_env(8, observation, episode_steps=6))  # episodes end, and are bootstrapped, within a rollout
     agent = PPO(POLICIES[observation], env, n_steps=10, batch_size=40, n_epochs=1, seed=0, device="cpu")

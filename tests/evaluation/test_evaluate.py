@@ -84,11 +84,7 @@ class ScriptedRace(EnvBase):
 
 DONE = ("done", "terminated", "truncated")
 STATE = {"position": 3, "attitude": 4, "linear_velocity": 3, "body_rates": 3, "target_gate": 1}
-SCRIPT = [
-    [(2, "ground"), (9, FINISHED)],
-    [(30, TIMEOUT)],
-    [(4, "gate_frame"), (6, FINISHED), (1, "ground")],
-]
+SCRIPT = [[(2, "ground"), (9, FINISHED)], [(30, TIMEOUT)], [(4, "gate_frame"), (6, FINISHED), (1, "ground")]]
 
 
 def idle(n: int = len(SCRIPT)) -> TensorDictModule:

@@ -48,7 +48,7 @@ from dreamer_racing.modules import Interface, ModelSize, get_size
 from dreamer_racing.modules.agent import Agent
 from dreamer_racing.modules.rssm import mix_uniform
 from tests.export.recorded import answered
-from tests.running_recipes import recipe
+from tests.running_recipes import UNDRAWN, recipe, recipe_module
 
 pytest.importorskip("onnxscript")
 pytest.importorskip("onnxruntime")
@@ -673,7 +673,7 @@ def run_dir(tmp_path_factory: pytest.TempPathFactory) -> Path:
         "dreamer_v3", "track=circle", "model=debug", "loss=privileged", "env.preset=faithful", "env.camera_tilt=30",
         "env.image_size=32", "env.control_rate=40", "model.state_std=false",
         "env.num_envs=4", "prefill=100", "total_env_steps=160", "replay.capacity=1000", "evaluation.every=0",
-        f"run_dir='{directory}'", cwd=directory.parent,
+        f"run_dir='{directory}'", cwd=directory.parent, before=UNDRAWN,
     )  # fmt: skip
     assert done.returncode == 0, done.stderr
     return directory
@@ -725,37 +725,24 @@ def test_the_recipe_refuses_a_copy_that_flies_differently(run_dir: Path) -> None
 
 
 @pytest.mark.parametrize(
-    ("overrides", "words"),
+    ("settings", "words"),
     [
-        (["latent=median"], ["latent=median", "mode", "sample"]),
-        (["checkpoint=/nowhere"], ["/nowhere", "does not exist"]),
-        (["output=/dev/null/x/actor.onnx"], ["/dev/null/x", "cannot write"]),
-        (["steps=10"], ["steps=10", "200"]),
+        ({"latent": "median"}, ["latent=median", "mode", "sample"]),
+        ({"checkpoint": "/nowhere"}, ["/nowhere", "does not exist"]),
+        ({"output": "/dev/null/x/actor.onnx"}, ["/dev/null/x", "cannot write"]),
+        ({"steps": 10}, ["steps=10", "200"]),
     ],
-    ids=lambda value: value[0] if isinstance(value, list) else None,
+    ids=lambda value: next(iter(value)) if isinstance(value, dict) else None,
 )
-def test_bad_input_gets_a_plain_error(run_dir: Path, overrides: list[str], words: list[str]) -> None:
-    done = recipe("export", f"checkpoint='{run_dir}'", *overrides, cwd=run_dir.parent)
-    assert done.returncode == 2 and "Traceback" not in done.stderr
-    assert all(word in done.stderr for word in words), done.stderr
-    assert len(done.stderr.strip().splitlines()) <= 6
-
-
-def test_only_actors_that_race_are_exported(run_dir: Path, tmp_path: Path) -> None:
-    shutil.copytree(run_dir, tmp_path / "run", ignore=shutil.ignore_patterns("export"))
-    config = OmegaConf.load(tmp_path / "run" / "config.yaml")
-    config.env.suite, config.task = "dmc", "cartpole_swingup"
-    OmegaConf.save(config, tmp_path / "run" / "config.yaml")
-    done = recipe("export", "checkpoint=run", cwd=tmp_path)
-    assert done.returncode == 2 and "Traceback" not in done.stderr
-    assert "was trained on cartpole_swingup" in done.stderr and not (tmp_path / "run" / "export").exists()
-
-
-def test_missing_packages_are_named(run_dir: Path) -> None:
-    before = "import dreamer_racing.export.actor_step as export\nexport.PACKAGES = ('onnx', 'no_such_package')\n"
-    done = recipe("export", f"checkpoint='{run_dir}'", cwd=run_dir.parent, before=before)
-    assert done.returncode == 1 and "Traceback" not in done.stderr
-    assert "[export]'" in done.stderr and "no_such_package" in done.stderr
+def test_bad_input_gets_a_plain_error(
+    run_dir: Path, settings: dict, words: list[str], capsys: pytest.CaptureFixture[str]
+) -> None:
+    exporting = recipe_module("export")
+    with pytest.raises(SystemExit) as refused, recipe_module("composing.entry").plain_errors():
+        exporting.export(exporting.ExportConfig(**{"checkpoint": str(run_dir), **settings}))
+    said = capsys.readouterr().err
+    assert refused.value.code == 2 and all(word in said for word in words), said
+    assert len(said.strip().splitlines()) <= 6
 
 
 def test_the_contract_of_an_agent_that_sees_numbers_lists_them() -> None:

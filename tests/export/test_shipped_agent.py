@@ -19,14 +19,7 @@ from dreamer_racing.export.actor_step import ActorStep, export_actor
 from dreamer_racing.export.contract import hash_weights, make_contract
 from dreamer_racing.export.onnx_actor import CONTRACT, OnnxActor, read_contract
 from dreamer_racing.export.parity import MIN_STEPS
-from dreamer_racing.export.shipped_agent import (
-    FILES,
-    ShippedAgent,
-    check_env,
-    choose_weights,
-    is_agent,
-    load_agent,
-)
+from dreamer_racing.export.shipped_agent import FILES, ShippedAgent, check_env, choose_weights, is_agent, load_agent
 from dreamer_racing.export.weights_file import read_weights, write_weights
 from dreamer_racing.modules import Interface, get_size
 from dreamer_racing.modules.agent import Agent

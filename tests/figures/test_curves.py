@@ -20,13 +20,7 @@ from dreamer_racing.figures.curves import (
     write_curves,
 )
 from dreamer_racing.figures.evaluations import evaluation_files, evaluation_score
-from dreamer_racing.figures.runs import (
-    CurveKey,
-    find_runs,
-    first_of_each_curve,
-    group_runs,
-    read_runs,
-)
+from dreamer_racing.figures.runs import CurveKey, find_runs, first_of_each_curve, group_runs, read_runs
 from dreamer_racing.training.metrics import read_metrics
 
 

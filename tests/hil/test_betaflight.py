@@ -8,14 +8,7 @@ from pathlib import Path
 import pytest
 
 from dreamer_racing.export.onnx_actor import read_contract
-from dreamer_racing.hil.betaflight import (
-    LINKS,
-    Status,
-    check_dump,
-    print_settings,
-    rate_map,
-    wanted_settings,
-)
+from dreamer_racing.hil.betaflight import LINKS, Status, check_dump, print_settings, rate_map, wanted_settings
 from dreamer_racing.hil.betaflight.__main__ import main
 
 CONTRACT = Path(__file__).parents[2] / "agents" / "kidney" / "contract.json"

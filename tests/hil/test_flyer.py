@@ -196,12 +196,7 @@ def test_a_flat_battery_needs_more_throttle():
     assert low.to_sticks(0.9 * 16.0 / 0.6) == 1.0  # more than there is left
 
 
-@given(
-    thrust=st.floats(IDLE_THRUST, 16.0 / 0.6),
-    roll=st.floats(-10, 10),
-    pitch=st.floats(-8, 8),
-    yaw=st.floats(-4, 4),
-)
+@given(thrust=st.floats(IDLE_THRUST, 16.0 / 0.6), roll=st.floats(-10, 10), pitch=st.floats(-8, 8), yaw=st.floats(-4, 4))
 def test_sticks_lead_back_to_the_setpoint(thrust, roll, pitch, yaw):
     setpoint = from_sticks(to_sticks(Setpoint(thrust, np.array([roll, pitch, yaw])), RATES, THRUST), RATES, THRUST)
     assert setpoint.collective_thrust == pytest.approx(thrust, abs=1e-9)

@@ -123,11 +123,11 @@ def test_it_learns_a_bandit() -> None:
     assert learner.updates == 25 * 5 * 8
 
 
-def test_networks_of_another_size_are_refused() -> None:
-    learner = PPOLearner(SMALL, NUMBERS, seed=0)
-    saved = PPOLearner(NetworkSize(3, 8), NUMBERS, seed=0).state_dict()
+@pytest.mark.parametrize("kind", [PPOLearner, SACLearner])
+def test_networks_of_another_size_are_refused(kind: type[PPOLearner | SACLearner]) -> None:
+    saved = kind(NetworkSize(3, 8), NUMBERS, seed=0).state_dict()
     with pytest.raises(ValueError, match="network.layers=3, this learner's with 2: set network.layers=3"):
-        learner.load_state_dict(saved)
+        kind(SMALL, NUMBERS, seed=0).load_state_dict(saved)
 
 
 def test_networks_for_other_images_are_refused() -> None:
@@ -327,8 +327,3 @@ def test_a_reward_that_is_not_finite_changes_no_network() -> None:
     with pytest.raises(NonFiniteLossError):
         learner.update(windows)
     assert all(torch.equal(value, before[name]) for name, value in learner.actor.state_dict().items())
-
-
-def test_networks_of_another_size_are_refused_by_sac() -> None:
-    with pytest.raises(ValueError, match="network.layers=3, this learner's with 2"):
-        SACLearner(WIDE, NUMBERS).load_state_dict(SACLearner(NetworkSize(3, 8), NUMBERS).state_dict())

@@ -169,10 +169,7 @@ def test_embedding_is_a_fixed_target_of_the_decoder_free_loss():
     assert untouched(world_model.reward_head)
 
 
-@pytest.mark.parametrize(
-    ("name", "own"),
-    [("privileged", "State"), ("informed", "State"), ("decoder_free", "Barlow")],
-)
+@pytest.mark.parametrize(("name", "own"), [("privileged", "State"), ("informed", "State"), ("decoder_free", "Barlow")])
 def test_parameters_of_a_loss_are_trained_and_saved(name, own):
     learner = make_learner(world_model=name)
     shared = set(map(id, learner.agent.parameters()))
@@ -208,14 +205,6 @@ def test_frozen_restores_flags_after_an_error():
     with pytest.raises(RuntimeError, match="out of memory"), frozen(module):
         raise RuntimeError("out of memory")
     assert all(parameter.requires_grad for parameter in module.parameters())
-
-
-def test_actor_through_the_dynamics_leaves_the_flags_as_they_were():
-    learner = make_learner(actor="dynamics")
-    before = trainable(learner.agent)
-    assert "world_model.rssm.initial_belief" not in before
-    learner.update(make_batch())
-    assert trainable(learner.agent) == before
 
 
 @pytest.mark.parametrize("recurrence", ["dense", "block", "ssm"])

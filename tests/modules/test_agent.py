@@ -135,15 +135,6 @@ def test_deterministic_flag_switches_sampling_off():
     assert torch.equal(policy(root.clone())["action"], policy(root.clone())["action"])
 
 
-def test_is_init_makes_old_latents_irrelevant():
-    _, policy = make_policy(deterministic=True)
-    root = make_env(policy).reset()
-    stale = root.clone()
-    for key in ("belief", "state", "previous_action"):
-        stale[key] = torch.randn_like(stale[key])
-    assert torch.equal(policy(root)["action"], policy(stale)["action"])
-
-
 @pytest.mark.parametrize("batch", [[], [4], [2, 3]])
 def test_policy_takes_any_batch_size(batch):
     _, policy = make_policy()

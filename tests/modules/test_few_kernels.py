@@ -15,7 +15,6 @@ from dreamer_racing.modules import ModelSize, few_kernels, get_size
 from dreamer_racing.modules.few_kernels import cast_once
 from dreamer_racing.modules.layers import BlockLinear, LayerNorm, RMSNorm, autocast, linear, unrolled
 from dreamer_racing.modules.recurrent_cells import GatedUpdate, gate_shift, gated_update
-from dreamer_racing.modules.rssm import sample_one_hot
 from tests.dreamers import imagine_from, latent_ppo_of, learner_of
 from tests.learners.test_dreamer_v3 import make_batch
 
@@ -139,15 +138,6 @@ def test_the_update_by_hand_has_the_gradients_of_autograd() -> None:
     parts = [part.flatten(1) for part in gates.unbind(2)]
     torch.testing.assert_close(GatedUpdate.apply(gates, shift, belief), gated_update(*parts, belief))
     assert torch.autograd.gradcheck(lambda *inputs: GatedUpdate.apply(inputs[0], shift, inputs[1]), (gates, belief))
-
-
-def test_a_sample_passes_its_gradient_to_what_it_was_drawn_by() -> None:
-    probabilities = torch.rand(5, 2, 4).softmax(-1).requires_grad_()
-    sample = sample_one_hot(probabilities, torch.full((5, 2, 1), 1.0 - 1e-7))
-    assert (sample.argmax(-1) == 3).all() and torch.equal(sample.sum(-1), torch.ones(5, 2))
-    weight = torch.randn(5, 2, 4)
-    (sample * weight).sum().backward()
-    assert torch.equal(probabilities.grad, weight)
 
 
 def test_weights_are_cast_by_one_kernel_and_come_back() -> None:

@@ -121,10 +121,7 @@ def test_interface_of_the_race(from_pixels, privileged):
 
 SIZE = SIZES["debug"]
 VECTOR_DIM = 7
-SIGHTS = {
-    "vector": Interface(pixels=False, vector_dim=VECTOR_DIM),
-    "both": Interface(vector_dim=VECTOR_DIM),
-}
+SIGHTS = {"vector": Interface(pixels=False, vector_dim=VECTOR_DIM), "both": Interface(vector_dim=VECTOR_DIM)}
 
 
 @pytest.mark.parametrize("norm", ["rms", "layer"])

@@ -34,7 +34,7 @@ def run_dir(tmp_path_factory: pytest.TempPathFactory) -> Path:
     done = recipe(
         "dreamer_v3", "track=circle", "model=debug", "model.average_rate=0.1", "loss=privileged", "env.image_size=32",
         "env.control_rate=25", "env.num_envs=4", "prefill=100", "total_env_steps=160", "replay.capacity=1000",
-        "evaluation.every=0", f"run_dir={directory}", cwd=directory.parent,
+        "evaluation.every=0", f"run_dir={directory}", cwd=directory.parent, before=UNDRAWN,
     )  # fmt: skip
     assert done.returncode == 0, done.stderr
     return directory
@@ -87,7 +87,7 @@ def test_an_agent_is_flown_evaluated_and_exported_as_its_run_is(agent: Path, run
     assert {path.name for path in (tmp_path / "fly").iterdir()} == {
         "evaluation.json", "top_down.png", "onboard.mp4", "onboard.gif", "flight_trajectory.csv", "flight_onboard.npz",
     }  # fmt: skip
-    done = recipe("evaluate", f"checkpoint={agent}", *EVALUATION, cwd=tmp_path)
+    done = recipe("evaluate", f"checkpoint={agent}", *EVALUATION, cwd=tmp_path, before=UNDRAWN)
     assert done.returncode == 0, done.stderr
     written = json.loads((tmp_path / "runs" / "agent_mine" / "evaluation" / "evaluation.json").read_text())
     expected = json.loads((run_dir / "evaluation_2" / "evaluation.json").read_text())

@@ -35,7 +35,7 @@ from torch import Tensor
 
 from dreamer_racing.envs import DroneRacingEnv
 from dreamer_racing.training.checkpoint import load_state
-from tests.running_recipes import recipe
+from tests.running_recipes import UNDRAWN, recipe
 
 STORED = Path(__file__).with_name("golden.json")
 CLOCKS = ("time/", "rate/", "wall_clock", "cpu_clock")
@@ -73,7 +73,8 @@ def train(name: str, folder: Path) -> dict[str, Any]:
     """Train one of the runs in a folder; return what is stored of it."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("OMP_NUM_THREADS", "1")
-        done = recipe(ALGORITHMS[name], *COMMON, *RUNS[name], f"run_dir={name}", cwd=folder, timeout=900)
+        settings = [*COMMON, *RUNS[name], f"run_dir={name}"]
+        done = recipe(ALGORITHMS[name], *settings, cwd=folder, timeout=900, before=UNDRAWN)
     assert done.returncode == 0, done.stderr[-2000:]
     state, metadata = load_state(folder / name, "learner")
     with (folder / name / "metrics.csv").open(newline="") as file:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 from pathlib import Path
 
 import pytest
@@ -15,17 +16,24 @@ NUMBERS = ["env.from_pixels=false", "prefill=64"]
 AS_SHIPPED = ["tuned=race", "model=cpu_small", "prefill=4000", "total_env_steps=8000", "replay.capacity=20000"]
 
 
-@pytest.fixture
-def trained(tmp_path: Path) -> Path:
+@pytest.fixture(scope="module")
+def saved(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A run with weights that no other begins with."""
-    run = prepared(*TINY, *NUMBERS, f"run_dir={tmp_path / 'first'}", "seed=7", "model.average_rate=0.1")
+    run_dir = tmp_path_factory.mktemp("runs") / "first"
+    run = prepared(*TINY, *NUMBERS, f"run_dir={run_dir}", "seed=7", "model.average_rate=0.1")
     with torch.no_grad():
         for parameter in (*run.learner.agent.parameters(), *run.learner.averaged.parameters()):
             parameter.add_(0.125)
     run.counters["env_steps"], run.learner.updates = 640, 11
     run.save()
     run.close()
-    return tmp_path / "first"
+    return run_dir
+
+
+@pytest.fixture
+def trained(saved: Path, tmp_path: Path) -> Path:
+    """A copy of that run."""
+    return shutil.copytree(saved, tmp_path / "first")
 
 
 def test_all_weights_of_a_run_and_nothing_else(trained: Path, capsys: pytest.CaptureFixture[str]) -> None:

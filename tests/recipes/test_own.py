@@ -165,14 +165,16 @@ def test_a_run_keeps_the_track_of_a_file_that_is_gone(track: Track, tmp_path: Pa
     file, directory, agent = tmp_path / "tracks" / "mine.yaml", tmp_path / "run", tmp_path / "mine"
     write(track, file)
     short = [override for override in TINY if not override.startswith("track=")]
-    begun = recipe("dreamer_v3", f"track={file}", *short, "run_dir=run", cwd=tmp_path)
+    begun = recipe("dreamer_v3", f"track={file}", *short, "run_dir=run", cwd=tmp_path, before=UNDRAWN)
     assert begun.returncode == 0, begun.stderr
     write(load_track("circle"), file)
-    resumed = recipe("dreamer_v3", "resume=run", "budget=none", "total_env_steps=240", cwd=tmp_path)
+    longer = ["budget=none", "total_env_steps=240"]
+    resumed = recipe("dreamer_v3", "resume=run", *longer, cwd=tmp_path, before=UNDRAWN)
     assert resumed.returncode == 0, resumed.stderr
     assert f"track: {file} has changed since the run started; the run keeps the old track\n" in resumed.stdout
     # a choice of settings composes everything anew, up to what is noted
-    again = recipe("dreamer_v3", "resume=run", "tuned=auto", *short, "total_env_steps=280", cwd=tmp_path)
+    anew = ["tuned=auto", *short, "total_env_steps=280"]
+    again = recipe("dreamer_v3", "resume=run", *anew, cwd=tmp_path, before=UNDRAWN)
     assert again.returncode == 0 and "has changed since" in again.stdout, again.stderr
     of_now = recipe("evaluate", "checkpoint=run", f"track={file}", *EVALUATION, cwd=tmp_path, before=UNDRAWN)
     assert of_now.returncode == 0, of_now.stderr

@@ -65,7 +65,7 @@ def test_a_kill_behind_the_last_checkpoint_costs_nothing_and_adds_nothing(run_di
     shutil.copytree(run_dir, killed)
     (killed / "finished.json").unlink()
     before = (killed / "metrics.csv").read_text()
-    done = recipe("dreamer_v3", f"resume={killed}", cwd=tmp_path)
+    done = recipe("dreamer_v3", f"resume={killed}", cwd=tmp_path, before=UNDRAWN)
     assert done.returncode == 0, done.stderr
     assert (killed / "finished.json").exists()
     assert (killed / "metrics.csv").read_text() == before
@@ -107,8 +107,14 @@ def test_a_resumed_run_cannot_change_its_track(run_dir: Path) -> None:
         training.resumed_config("dreamer_v3", str(run_dir), ["env.camera_tilt=10"])
     with pytest.raises(ValueError, match="trained with init_from=None, which cannot change"):
         training.resumed_config("dreamer_v3", str(run_dir), ["init_from=kidney"])
+    with pytest.raises(ValueError, match=r"trained with env.control_rate=50.0, which cannot change"):
+        training.resumed_config("dreamer_v3", str(run_dir), ["env.control_rate=25"])
+    with pytest.raises(ValueError, match="was trained by dreamer_v3: continue it with recipes/dreamer_v3.py."):
+        training.resumed_config("latent_ppo", str(run_dir), [])
+    same = ["track=circle", "env.control_rate=50", "seed=1"]
     with hydra.initialize_config_dir(str(CONFIG), version_base="1.3"):
-        _, overrides = training.resumed_config("dreamer_v3", str(run_dir), ["track=circle", "seed=1"])
+        config, overrides = training.resumed_config("dreamer_v3", str(run_dir), same)
+    assert config.env.control_rate == 50
     names = [override.partition("=")[0] for override in overrides]
     assert len(names) == len(set(names)), "an override stands twice"
 
@@ -206,7 +212,7 @@ def test_the_full_protocol(run_dir: Path, tmp_path: Path) -> None:
 
 @pytest.mark.slow
 def test_the_perception_report(run_dir: Path, tmp_path: Path) -> None:
-    options = ["episodes=2", "num_envs=2", "run_dir=seen"]
+    options = ["episodes=1", "num_envs=1", "run_dir=seen"]
     done = recipe("perception", f"checkpoint='{run_dir}'", "track=figure8", *options, cwd=tmp_path)
     assert done.returncode == 0, done.stderr
     report = json.loads((tmp_path / "seen" / "perception.json").read_text())
@@ -235,15 +241,6 @@ def test_a_new_run_needs_its_own_directory(run_dir: Path, capsys: pytest.Capture
     message = capsys.readouterr().err
     assert "holds a run already" in message and f"resume={run_dir}" in message and before[-1].name in message
     assert sorted((run_dir / "checkpoints").iterdir()) == before
-
-
-def test_a_run_goes_on_at_its_control_rate(run_dir: Path) -> None:
-    resumed = recipe_module("composing.launching").resumed_config
-    with pytest.raises(ValueError, match=r"trained with env.control_rate=50.0, which cannot change"):
-        resumed("dreamer_v3", str(run_dir), ["env.control_rate=25"])
-    with hydra.initialize_config_dir(str(CONFIG), version_base="1.3"):
-        config, _ = resumed("dreamer_v3", str(run_dir), ["env.control_rate=50"])
-    assert config.env.control_rate == 50
 
 
 def test_a_run_goes_on_with_its_settings_whatever_today_s_are(run_dir: Path, tmp_path: Path) -> None:

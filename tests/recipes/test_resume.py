@@ -114,10 +114,7 @@ RACE = [
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "tuned"),
-    [
-        ("dreamer_v3", ["tuned=none"]),
-        ("latent_ppo", [*RACE, "loss.ppo.steps=128", "model=ssm_debug"]),
-    ],
+    [("dreamer_v3", ["tuned=none"]), ("latent_ppo", [*RACE, "loss.ppo.steps=128", "model=ssm_debug"])],
     ids=["none", "race in a state-space model"],
 )
 def test_a_resumed_run_equals_an_uninterrupted_one(name: str, tuned: list[str], tmp_path: Path) -> None:
@@ -221,11 +218,3 @@ def test_a_run_writes_the_same_rows_wherever_it_is_stopped(name: str, tmp_path: 
     train(tmp_path, "resume=other", name=name)
     assert metrics(tmp_path / "whole") == metrics(tmp_path / "other")
     assert_same(parts(tmp_path / "whole"), parts(tmp_path / "other"), "checkpoint")
-
-
-def test_a_run_is_continued_by_the_recipe_that_began_it(tmp_path: Path) -> None:
-    train(
-        tmp_path, *SETTINGS, "tuned=none", "env.from_pixels=false", "track=circle", "run_dir=run", "total_env_steps=100"
-    )
-    done = recipe("latent_ppo", "resume=run", cwd=tmp_path)
-    assert done.returncode == 2 and "was trained by dreamer_v3: continue it with recipes/dreamer_v3.py." in done.stderr

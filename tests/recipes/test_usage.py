@@ -187,8 +187,9 @@ def test_no_option_lets_a_value_of_another_kind_or_size_through_to_a_traceback(
     check(recipe, copy.deepcopy(whole))  # as it is, it is taken
     state = pickle.dumps(whole)  # quicker copied by this than by deepcopy
     config, refused, wrong = pickle.loads(state), 0, []
-    each = 1 if len(options) < MANY else 3  # of the values, in turn
+    shared = set(names(TRAINING[0])) if recipe in TRAINING[1:] else set()  # which have all of their values there
     for index, name in enumerate(options):
+        each = len(ODD) if name in shared else 1 if len(options) < MANY else 3  # of the values, in turn
         for value in ODD[index % each :: each]:
             try:
                 OmegaConf.update(config, name, value)

@@ -7,6 +7,7 @@ from pathlib import Path
 import pytest
 
 from tests.robustness import faults, fuzz
+from tests.running_recipes import UNDRAWN, recipe
 
 
 @pytest.mark.slow
@@ -21,6 +22,8 @@ def test_a_run_does_not_care_what_time_it_is(tmp_path: Path, monkeypatch: pytest
     """Kills, signals, damage and full disks have tests of their own in tests/recipes and tests/training."""
     monkeypatch.setenv("OMP_NUM_THREADS", "1")
     short = ["evaluation.every=200", "total_env_steps=400"]  # a checkpoint and an evaluation on the way
-    monkeypatch.setattr(faults, "SETTINGS", [*faults.SETTINGS, *short])
-    cases = list(faults.Arena(tmp_path).clocks())
-    assert len(cases) == 2 and all(case["survived"] for case in cases), cases
+    for name, clock in (("whole", ""), ("still", faults.STILL), ("backwards", faults.BACKWARDS)):
+        run = [*faults.SETTINGS, *short, f"run_dir={name}"]
+        done = recipe(faults.RECIPE.stem, *run, cwd=tmp_path, before=UNDRAWN + clock)
+        assert not faults.trouble(done.returncode, done.stderr), name
+        assert not faults.difference(tmp_path / "whole", tmp_path / name), name

@@ -114,13 +114,6 @@ def test_restored_run_continues_identically(tmp_path):
     assert all(torch.equal(a, b) for a, b in zip(actual[3:], expected[3:], strict=True))
 
 
-def test_keeps_the_last_ones(saved):
-    assert sorted(path.name for path in (saved / "checkpoints").iterdir()) == [
-        "checkpoint-000000000020",
-        "checkpoint-000000000030",
-    ]
-
-
 def test_second_save_at_the_same_step_does_nothing(saved):
     run = Run(saved)
     run.checkpoints.load()

@@ -14,13 +14,7 @@ import pytest
 
 from dreamer_racing.training import directory
 from dreamer_racing.training.clock import Interval, Journal, Periods
-from dreamer_racing.training.directory import (
-    RunDirectory,
-    RunLock,
-    complete_checkpoints,
-    fresh_directory,
-    replace_text,
-)
+from dreamer_racing.training.directory import RunDirectory, RunLock, complete_checkpoints, fresh_directory, replace_text
 from dreamer_racing.training.metrics import PendingMetrics
 
 

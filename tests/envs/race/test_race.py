@@ -39,9 +39,7 @@ def fly(race: Race, *points, rates=(0.0, 0.0, 0.0), invalid: bool = False) -> Ra
     path = torch.stack([torch.as_tensor(point, dtype=torch.float64) for point in points])
     path = path.unsqueeze(1).repeat(1, num_envs, 1)
     return race.step(
-        path,
-        torch.tensor(rates, dtype=torch.float64).repeat(num_envs, 1),
-        torch.full((num_envs,), invalid),
+        path, torch.tensor(rates, dtype=torch.float64).repeat(num_envs, 1), torch.full((num_envs,), invalid)
     )
 
 
@@ -120,12 +118,6 @@ def test_lap_times():
     assert hover(race, 2).lap_time.item() == 0.0
     times = [fly(race, *through(gate)).lap_time.item() for gate in range(4)]
     assert times == [0.0, 0.0, 0.0, pytest.approx(0.12)]  # two hovering and four passing
-
-
-def test_control_dt_scales_lap_times():
-    race = begin(control_dt=0.05)
-    times = [fly(race, *through(gate)).lap_time.item() for gate in range(4)]
-    assert times[-1] == pytest.approx(0.2)
 
 
 def test_a_lap_may_begin_at_any_gate():

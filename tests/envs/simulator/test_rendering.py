@@ -142,7 +142,15 @@ def test_workers_that_were_made_are_freed_where_another_fails() -> None:
 # noticed.
 
 
-AGENTS = sorted(file.parent for file in (Path(__file__).parents[3] / "agents").glob("*/config.yaml"))
+def camera_of(agent: Path) -> tuple[object, ...]:
+    """Track, size of the images and tilt."""
+    config = yaml.safe_load((agent / "config.yaml").read_text(encoding="utf-8"))
+    return config["track"], config["env"]["image_size"], config["env"]["camera_tilt"]
+
+
+EACH = sorted(file.parent for file in (Path(__file__).parents[3] / "agents").glob("*/config.yaml"))
+AGENTS = list({camera_of(agent): agent for agent in EACH}.values())
+"""One of those that see the same."""
 GOLDEN = Path(__file__).parent / "golden_images"
 FRAMES = 3
 BOUND = 2.0

@@ -164,11 +164,7 @@ def test_a_good_file(write):
     for argument in (path, str(path)):
         assert load_track(argument) == Track(
             name="mine",
-            gates=(
-                Gate((0, 0, 1.35), 0),
-                Gate((6, 0, 1.35), 0, color=(1, 0.5, 0)),
-                Gate((6, 6, 1.35), 180),
-            ),
+            gates=(Gate((0, 0, 1.35), 0), Gate((6, 0, 1.35), 0, color=(1, 0.5, 0)), Gate((6, 6, 1.35), 180)),
             decoys=(Gate((0, 6, 1.35), 45, kind="decoy"),),
             shape=GateShape(opening=1.4, margin=0.2),
             start_position=(-2, 0.5, 1),
@@ -250,11 +246,7 @@ def test_refusals_name_file_field_and_value(write, case):
 
 @pytest.mark.parametrize(
     ("field", "gate", "start", "laps"),
-    [
-        ("gates[1].position", 600, -3, 1),
-        ("start.position", 900, -900, 1),
-        ("gates[0].position", 450, -3, 2),
-    ],
+    [("gates[1].position", 600, -3, 1), ("start.position", 900, -900, 1), ("gates[0].position", 450, -3, 2)],
     ids=["a gate", "the start", "the next lap"],
 )
 def test_a_leg_beyond_the_range_of_a_flight_is_refused(write, field, gate, start, laps):

@@ -217,12 +217,7 @@ def hears_mavlink(data):
 
 
 @pytest.mark.parametrize(
-    ("name", "hears"),
-    [
-        ("udp", hears_command),
-        ("simulated", hears_command),
-        ("mavlink", hears_mavlink),
-    ],
+    ("name", "hears"), [("udp", hears_command), ("simulated", hears_command), ("mavlink", hears_mavlink)]
 )
 def test_links_over_udp(listener, name, hears):
     link = make_link(LinkConfig(name, port=listener.getsockname()[1], rates=RATES, thrust=THRUST))
