@@ -161,7 +161,10 @@ class ScheduleConfig:
         pairs = zip(lowest, highest, strict=True) if together and moving else product(lowest, highest)
         for (low, least), (high, most) in pairs:
             if least is not None and most is not None and least >= most:
-                raise ValueError(f"{low}={least} must be below {high}={most}: the bounds of the standard deviation.")
+                apart = ", which move at different times (begin, end, by)" if moving else ""
+                raise ValueError(
+                    f"{low}={least} must be below {high}={most}: the bounds of the standard deviation{apart}."
+                )
 
 
 @dataclass
