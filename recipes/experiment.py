@@ -72,6 +72,12 @@ def main(settings: ExperimentConfig) -> None:
         note.write_text(f"{error}\n", encoding="utf-8")
 
 
+def check(config: ExperimentConfig) -> None:
+    """Refuse an unknown algorithm or variant."""
+    for name, known in (("algorithm", tuple(RECIPES)), ("variant", tuple(config.variants))):
+        check_choice(name, getattr(config, name), known)
+
+
 def directory_of(config: ExperimentConfig) -> Path:
     """Return the directory of one run."""
     name = f"{config.algorithm}_{Path(config.track).stem}_{config.variant}_seed{config.seed}"
@@ -109,8 +115,7 @@ def next_command(config: ExperimentConfig, given: list[str]) -> list[str] | None
     Raises:
         ValueError: the algorithm or the variant is unknown, or the directory holds a run with other settings.
     """
-    for name, known in (("algorithm", tuple(RECIPES)), ("variant", tuple(config.variants))):
-        check_choice(name, getattr(config, name), known)
+    check(config)
     run_dir = directory_of(config)
     chosen = [f"track={config.track}", f"seed={config.seed}", f"budget={config.budget}", *config.overrides]
     of_recipe = [override for override in given if override_key(override).partition(".")[0] not in EXPERIMENT_SETTINGS]
