@@ -283,11 +283,11 @@ def test_every_attack_of_the_benchmarks_is_in_a_row_and_what_was_not_measured_sa
 
 
 def examples() -> Iterator[str]:
-    """Modules whose docstrings show how they are used; lines with ``+SKIP`` are only shown."""
+    """Modules with examples that run; comments and lines with ``+SKIP`` are only shown."""
     for found in pkgutil.walk_packages(dreamer_racing.__path__, "dreamer_racing."):
         place = Path(ROOT, *found.name.split("."))
         file = place / "__init__.py" if found.ispkg else place.with_suffix(".py")
-        if ">>> " in file.read_text(encoding="utf-8"):
+        if re.search(r">>> (?!#)(?!.*\+SKIP)", file.read_text(encoding="utf-8")):
             yield found.name
 
 
@@ -295,7 +295,7 @@ def examples() -> Iterator[str]:
 def test_examples_do_what_they_say(module: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     found = doctest.testmod(importlib.import_module(module), optionflags=doctest.NORMALIZE_WHITESPACE)
-    assert not found.failed, f"{found.failed} of {found.attempted} lines, see above"
+    assert found.attempted and not found.failed, f"{found.failed} of {found.attempted} lines, see above"
 
 
 def test_every_guarantee_has_tests_that_are_there(reliability: ModuleType) -> None:

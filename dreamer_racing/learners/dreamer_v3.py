@@ -91,7 +91,7 @@ class DreamerV3(WorldModelLearner):
                 losses["loss_open_loop"] = open_loop_loss(model, latents, batch, numbers.open_loop_steps)
         self.store_latents(latents)
 
-        # Imagination takes more than half of an update's time, so it may be left out of some.
+        # Imagination takes much of an update's time, so it may be left out of some.
         if self.updates % self.config.imagination_every:
             with timed("imagine"):
                 return losses | self.replay_critic_losses(latents, batch)
