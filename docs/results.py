@@ -42,8 +42,8 @@ How well each algorithm flies here, what that took, and the command that runs it
 - **Use latent PPO**: `OMP_NUM_THREADS=1 ./dev python recipes/latent_ppo.py track=figure8 device=cpu`. With the true
   state in training it races all three tracks: 97 to 100 %, two seeds each, trained for 79 to 84 minutes on one core
   (one run of Circle for 33, on an AMD EPYC in bfloat16). Split-S: 92 %, one seed.
-- **DreamerV3** learns in imagination. Nearly today's default raced Kidney (one seed), the one before, *C*, Circle (two),
-  Kidney (one; another was cut short) and Figure 8 (one complete run): 100 %, 90 % after 27 to 90 minutes.
+- **DreamerV3** learns in imagination. Nearly today's default raced Kidney (one seed), the one before, *C*, Circle
+  (two), Kidney (one; another was cut short) and Figure 8 (one complete run): 100 %, 90 % after 27 to 90 minutes.
 - **Without the true state** latent PPO (two seeds) and DreamerV3 (one, settings changed on the way) race Circle: 100 %.
 - **PPO from the true state** flies three clean laps after 3 to 11 minutes.
 
