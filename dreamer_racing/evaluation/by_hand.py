@@ -11,6 +11,7 @@ import os
 import sys
 import time
 from collections.abc import Callable, Mapping
+from itertools import chain
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -22,6 +23,7 @@ from dreamer_racing.commands import install_extra
 
 KINDS = ("keyboard", "gamepad")
 WINDOW = 512  # pixels, side of the window
+KEYS = (("right", "left"), ("up", "down"), ("d", "a"), ("w", "s"))  # more and less roll, pitch, yaw and throttle
 KEYBOARD_SHARE = 0.35  # stick position of a key held down; below 1, because keys are all or nothing
 EASE = 0.25  # share of the remaining way that the sticks move towards the keys in a control step
 DEAD_ZONE = 0.06  # of a gamepad's stick
@@ -52,9 +54,7 @@ class FlightAbandonedError(Exception):
 class HandPolicy(TensorDictModuleBase):
     """Policy that follows sticks: reads `pixels` of one drone, writes `action`.
 
-    Args:
-        sticks: the source of stick positions.
-        hover_action: collective thrust of hover, in units of the action.
+    ``hover_action`` is the collective thrust of hover, in units of the action.
 
     Example:
         >>> from tensordict import TensorDict
@@ -77,15 +77,11 @@ class HandPolicy(TensorDictModuleBase):
 
 
 def keys_to_sticks(held: Mapping[str, bool], before: StickPositions) -> StickPositions:
-    """Move the sticks towards the positions that the keys command.
+    """Return the sticks a control step after ``before``, moved towards the positions that the keys command.
 
-    Args:
-        held: whether ``left``, ``right``, ``up``, ``down`` (roll and pitch), ``a``, ``d`` (yaw), ``w``, ``s``
-            (throttle) are held down; missing keys are not.
-        before: the stick positions one control step ago.
+    The keys are those of `KEYS`; missing ones are not held down.
     """
-    pairs = (("right", "left"), ("up", "down"), ("d", "a"), ("w", "s"))
-    wanted = [KEYBOARD_SHARE * (bool(held.get(more)) - bool(held.get(less))) for more, less in pairs]
+    wanted = [KEYBOARD_SHARE * (bool(held.get(more)) - bool(held.get(less))) for more, less in KEYS]
     return StickPositions(*(old + EASE * (new - old) for old, new in zip(before, wanted, strict=True)))
 
 
@@ -97,10 +93,6 @@ def axes_to_sticks(axes: Mapping[str, float]) -> StickPositions:
 
 def check_by_hand(kind: str, environment: Mapping[str, str] = os.environ) -> None:
     """Check that pygame and a display are available.
-
-    Args:
-        kind: ``keyboard`` or ``gamepad``.
-        environment: the environment variables.
 
     Raises:
         ValueError: pygame is not installed, or there is no display; the message names the remedy.
@@ -116,13 +108,9 @@ def check_by_hand(kind: str, environment: Mapping[str, str] = os.environ) -> Non
 
 
 class PygameSticks:
-    """A window with the on-board image, and a keyboard or a gamepad; runs a flight in real time.
+    """A window with the on-board image, and one of `KINDS`; runs a flight in real time, with steps of control_dt s.
 
     Arrows: roll and pitch. A and D: yaw. W and S: throttle. Escape ends the flight.
-
-    Args:
-        kind: ``keyboard`` or ``gamepad``.
-        control_dt: s, duration of a control step.
 
     Raises:
         ValueError: see `check_by_hand`; or there is no gamepad.
@@ -164,8 +152,9 @@ class PygameSticks:
         if self._gamepad is not None:
             return axes_to_sticks({name: self._gamepad.get_axis(axis) for name, axis in GAMEPAD_AXES.items()})
         held = pygame.key.get_pressed()
-        names = ("left", "right", "up", "down", "a", "d", "w", "s")
-        self._at = keys_to_sticks({name: held[pygame.key.key_code(name)] for name in names}, self._at)
+        self._at = keys_to_sticks(
+            {name: held[pygame.key.key_code(name)] for name in chain.from_iterable(KEYS)}, self._at
+        )
         return self._at
 
     def close(self) -> None:

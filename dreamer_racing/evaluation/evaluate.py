@@ -144,8 +144,7 @@ class Evaluation:
     @property
     def speed_mean(self) -> float:
         """Mean speed over all control steps, m/s."""
-        flown = sum(episode.speed_mean * episode.length for episode in self.episodes)
-        return flown / sum(episode.length for episode in self.episodes)
+        return self._mean_over_steps("speed_mean")
 
     @property
     def gate_offset_mean(self) -> float | None:
@@ -155,24 +154,23 @@ class Evaluation:
 
     @property
     def action_change_mean(self) -> float:
-        """Mean norm of the action's change over all pairs of successive control steps of an episode; 0 is smoothest.
-
-        Actions are clipped to [−1, 1], as in the environment.
-        """
+        """Mean norm of the action's change over all pairs of successive control steps of an episode; 0 is smoothest."""
         changes = sum(episode.action_change_mean * (episode.length - 1) for episode in self.episodes)
         return changes / max(1, sum(episode.length - 1 for episode in self.episodes))
 
     @property
     def saturation_share(self) -> float:
         """Share of time in which a motor command was at a limit, over all episodes."""
-        flown = sum(episode.saturation_share * episode.length for episode in self.episodes)
-        return flown / sum(episode.length for episode in self.episodes)
+        return self._mean_over_steps("saturation_share")
 
     @property
     def thrust_shortfall(self) -> float:
         """Mean thrust shortfall of the episodes, weighted by their lengths; see `Episode`."""
-        missed = sum(episode.thrust_shortfall * episode.length for episode in self.episodes)
-        return missed / sum(episode.length for episode in self.episodes)
+        return self._mean_over_steps("thrust_shortfall")
+
+    def _mean_over_steps(self, statistic: str) -> float:
+        total = sum(getattr(episode, statistic) * episode.length for episode in self.episodes)
+        return total / sum(episode.length for episode in self.episodes)
 
     @classmethod
     def join(cls, parts: Sequence[Evaluation]) -> Evaluation:
@@ -186,23 +184,10 @@ class Evaluation:
     def to_dict(self) -> dict[str, Any]:
         """Return all statistics and, under ``episodes``, every episode, as JSON values."""
         names = (
-            "success_rate",
-            "gates_per_episode",
-            "lap_time_best",
-            "lap_time_mean",
-            "speed_max",
-            "speed_mean",
-            "gate_offset_mean",
-            "action_change_mean",
-            "saturation_share",
-            "thrust_shortfall",
-            "crashes",
-            "crashes_by_gate",
-            "timeout_rate",
-            "return_mean",
-            "return_std",
-            "episode_length",
-        )
+            "success_rate", "gates_per_episode", "lap_time_best", "lap_time_mean", "speed_max", "speed_mean",
+            "gate_offset_mean", "action_change_mean", "saturation_share", "thrust_shortfall", "crashes",
+            "crashes_by_gate", "timeout_rate", "return_mean", "return_std", "episode_length",
+        )  # fmt: skip
         statistics = {name: getattr(self, name) for name in names}
         return {"num_episodes": len(self.episodes), **statistics, "episodes": [asdict(e) for e in self.episodes]}
 
@@ -242,7 +227,6 @@ def evaluate(
     *,
     exploration_type: ExplorationType = ExplorationType.DETERMINISTIC,
     num_trajectories: int = 1,
-    max_recorded_steps: int | None = None,
     record_pixels: bool = True,
     value_function: ValueFunction | None = None,
     on_episode: Callable[[int, int], None] | None = None,
@@ -260,7 +244,6 @@ def evaluate(
         episodes: number of episodes.
         exploration_type: what TorchRL's probabilistic policies return: mode or sample.
         num_trajectories: number of environments whose first episode is recorded.
-        max_recorded_steps: maximum length of a recording, K; None: the whole episode.
         record_pixels: whether to record observations (``pixels``, ``imu``, ``vector``); images take 12 KB a step.
         value_function: computes a value for each recorded step; None: recordings have no values.
         on_episode: called with the numbers of finished and of all episodes, after each step in which one finished.
@@ -283,30 +266,33 @@ def evaluate(
     control_dt = _check(env, episodes)
     num_envs = env.batch_size[0]
     shares = split_episodes(episodes, num_envs)
-    logs = [_EpisodeLog(control_dt) for _ in range(num_envs)]
+    begun: list[dict[str, list[float]]] = [defaultdict(list) for _ in range(num_envs)]  # of the current episodes
     flown: list[list[Episode]] = [[] for _ in range(num_envs)]
     with set_exploration_type(exploration_type):
         tensordict = env.reset()
         recorded = min(num_trajectories, num_envs, episodes)
-        longest = math.inf if max_recorded_steps is None else max_recorded_steps
-        recorder = TrajectoryRecorder(tensordict, recorded, longest, record_pixels)
+        recorder = TrajectoryRecorder(tensordict, recorded, record_pixels)
         action = torch.zeros(env.action_spec.shape, device=env.device)
         while any(len(done) < share for done, share in zip(flown, shares, strict=True)):
             if on_step:
                 on_step(tensordict)
             acted = policy(tensordict)
-            value = value_function(acted[:recorded]) if value_function and recorder.running else None
+            judged = value_function(acted[:recorded]) if value_function and recorder.running else None
             tensordict, following = env.step_and_maybe_reset(acted)
             action, action_before = _applied_action(tensordict["action"]), action
             change = (action - action_before).norm(dim=-1, keepdim=True)
             steps = _read_step(tensordict["next"], change, env.worlds.effort)
-            before = sum(map(len, flown))
-            for index, (log, step) in enumerate(zip(logs, steps, strict=True)):
+            outcomes, before = [_outcome(step) for step in steps], sum(map(len, flown))
+            for index, (step, outcome) in enumerate(zip(steps, outcomes, strict=True)):
                 if len(flown[index]) < shares[index]:
-                    flown[index] += log.add(step)
+                    for name, value in step.items():
+                        begun[index][name].append(value)
+                    if outcome is not None:
+                        flown[index].append(_summarise(begun[index], outcome, control_dt))
+                        begun[index].clear()
             if on_episode and (ended := sum(map(len, flown))) > before:
                 on_episode(ended, episodes)
-            recorder.add(tensordict, [_outcome(step) for step in steps], value)
+            recorder.add(tensordict, outcomes, judged)
             tensordict = following
     waves = range(max(shares))
     ordered = [flown[index][wave] for wave in waves for index in range(num_envs) if wave < shares[index]]
@@ -346,10 +332,7 @@ def _applied_action(action: Tensor) -> Tensor:
 def _read_step(after: TensorDictBase, action_change: Tensor, effort: Tensor) -> list[dict[str, float]]:
     """Return the measurements of one step, one dictionary per environment, with a single device transfer.
 
-    Args:
-        after: the tensordict under ``next``.
-        action_change: norm of the change from the previous action, (N, 1).
-        effort: motor effort, (N, 3), see `RaceWorlds.effort`.
+    Of the tensordict under ``next``, the change's norm (N, 1), and motor effort (N, 3), see `RaceWorlds.effort`.
     """
     columns = {
         "action_change": action_change,
@@ -373,52 +356,27 @@ def _outcome(step: dict[str, float]) -> str | None:
     return FINISHED if step["finished"] else TIMEOUT
 
 
-_KEPT = (
-    "reward", "speed", "gates_passed", "gate_offset", "lap_time", "action_change", "saturated", "thrust_asked",
-    "thrust_missing",
-)  # fmt: skip
-"""Measurements that are collected over an episode."""
-
-
-class _EpisodeLog:
-    """Collects the steps of one environment into episodes."""
-
-    def __init__(self, control_dt: float) -> None:
-        self._control_dt = control_dt
-        self._values: dict[str, list[float]] = defaultdict(list)
-
-    def add(self, step: dict[str, float]) -> list[Episode]:
-        """Add one step; return a list with the episode if it ended in this step, else an empty list."""
-        for name in _KEPT:
-            self._values[name].append(step[name])
-        outcome = _outcome(step)
-        if outcome is None:
-            return []
-        values, self._values = self._values, defaultdict(list)
-        speeds = [speed for speed in values["speed"] if speed < float("inf")] or [0.0]  # a diverged state has no speed
-        length = len(values["reward"])
-        passed = values["gates_passed"]
-        changes = values["action_change"][1:]  # the first is relative to the previous episode
-        episode = Episode(
-            reward_sum=sum(values["reward"]),
-            length=length,
-            duration=length * self._control_dt,
-            gates_passed=int(step["gates_passed"]),
-            outcome=outcome,
-            lap_times=[time for time in values["lap_time"] if time > 0],
-            gate_offsets=[
-                offset
-                for offset, before, after in zip(values["gate_offset"], [0, *passed], passed, strict=False)
-                if after > before
-            ],
-            speed_max=max(speeds),
-            speed_mean=_mean(speeds),
-            action_change_mean=_mean(changes) if changes else 0.0,
-            saturation_share=_mean(values["saturated"]),
-            thrust_shortfall=sum(values["thrust_missing"]) / max(sum(values["thrust_asked"]), 1e-9),
-            crash_gate=int(step["target_gate"]) if outcome in CRASHES else None,
-        )
-        return [episode]
+def _summarise(values: dict[str, list[float]], outcome: str, control_dt: float) -> Episode:
+    """Return the statistics of an episode from the measurements of its steps."""
+    speeds = [speed for speed in values["speed"] if speed < math.inf] or [0.0]  # a diverged state has no speed
+    changes = values["action_change"][1:]  # the first is relative to the previous episode
+    passed = values["gates_passed"]
+    passes = zip(values["gate_offset"], [0, *passed], passed, strict=False)
+    return Episode(
+        reward_sum=sum(values["reward"]),
+        length=len(passed),
+        duration=len(passed) * control_dt,
+        gates_passed=int(passed[-1]),
+        outcome=outcome,
+        lap_times=[time for time in values["lap_time"] if time > 0],
+        gate_offsets=[offset for offset, before, after in passes if after > before],
+        speed_max=max(speeds),
+        speed_mean=_mean(speeds),
+        action_change_mean=_mean(changes) if changes else 0.0,
+        saturation_share=_mean(values["saturated"]),
+        thrust_shortfall=sum(values["thrust_missing"]) / max(sum(values["thrust_asked"]), 1e-9),
+        crash_gate=int(values["target_gate"][-1]) if outcome in CRASHES else None,
+    )
 
 
 def _mean(values: list[Any]) -> float:

@@ -54,14 +54,9 @@ def measure_lag(
 
 @torch.no_grad()
 def world_model_metrics(learner: WorldModelLearner, batch: TensorDictBase) -> dict[str, Tensor]:
-    """Compute the world-model loss and metrics of a batch without changing networks or random state.
+    """Compute losses and metrics of the world-model loss without changing networks or random state.
 
-    Args:
-        learner: The learner with the world model.
-        batch: Records ``[W, T]`` in the format of ``WorldModelLearner.update``.
-
-    Returns:
-        Losses and metrics of the world-model loss, scalars on the learner's device.
+    The batch ``[W, T]`` has the format of ``WorldModelLearner.update``; results are scalars on the learner's device.
     """
     with _preserved_random_state(learner):
         losses, _ = learner.world_model_loss(batch.to(learner.device))

@@ -14,7 +14,6 @@ from torchrl.envs.transforms import Transform
 
 from dreamer_racing.learners.learner import Policy
 
-GREY = 128
 Corruption = Callable[[Tensor, Tensor], Tensor]
 """Maps images (N, H, W, 3) uint8 and ``is_init`` (N,) bool to the images that the policy sees."""
 
@@ -26,7 +25,7 @@ def intact(pixels: Tensor, is_init: Tensor) -> Tensor:
 
 def blank(pixels: Tensor, is_init: Tensor) -> Tensor:
     """Return grey images."""
-    return torch.full_like(pixels, GREY)
+    return torch.full_like(pixels, 128)
 
 
 class Frozen:
@@ -64,15 +63,7 @@ CORRUPTIONS: dict[str, Callable[[], Corruption]] = {
 
 
 class CorruptedPolicy(torch.nn.Module):
-    """A policy that acts on corrupted images; the tensordict keeps the original ones.
-
-    Args:
-        policy: a policy that reads ``pixels``.
-        corruption: the corruption of the images.
-
-    Example:
-        >>> # result = fly(CorruptedPolicy(policy, blank), {"track": "circle"}, episodes=10)
-    """
+    """A policy that acts on corrupted images; the tensordict keeps the original ones."""
 
     def __init__(self, policy: Policy, corruption: Corruption) -> None:
         super().__init__()

@@ -113,7 +113,6 @@ def run_protocol(
     episodes: int = EPISODES,
     *,
     conditions: Sequence[Condition] = CONDITIONS,
-    presets: Sequence[str] = PRESETS,
     num_envs: int | None = None,
     seed: int = 0,
 ) -> Iterator[Result]:
@@ -126,31 +125,24 @@ def run_protocol(
         worlds: arguments of `DroneRacingEnv`: ``track``, ``camera``, ``renderer``, ``from_pixels``.
         episodes: number of episodes per condition.
         conditions: the conditions.
-        presets: physics presets.
         num_envs: see `Course`.
         seed: seed of starts, displaced gates, physics and looks. Both modes and all policies get the same races, within
             the limits that `Course` describes.
     """
     track = load_track(worlds["track"])
-    for preset in presets:
+    for preset in PRESETS:
         for condition in conditions:
             if condition.needs_images and not worlds.get("from_pixels", True):
                 continue
             races = list(condition.races(track, seed))
             shares = split_episodes(episodes, len(races))
             for mode in MODES:
-                parts = [
-                    fly(
-                        policy,
-                        {**worlds, "preset": preset, **race},
-                        share,
-                        mode == "deterministic",
-                        num_envs,
-                        num_trajectories=int(race is races[0]),
-                    )
-                    for race, share in zip(races, shares, strict=True)
-                    if share
-                ]
+                parts = []
+                for race, share in zip(races, shares, strict=True):
+                    if share:
+                        there, recorded = {**worlds, "preset": preset, **race}, int(race is races[0])
+                        deterministic = mode == "deterministic"
+                        parts.append(fly(policy, there, share, deterministic, num_envs, num_trajectories=recorded))
                 yield Result(preset, condition.name, mode, races[0]["track"], Evaluation.join(parts))
 
 
@@ -176,16 +168,7 @@ def fly(
     num_envs: int | None = None,
     **recording: Any,
 ) -> Evaluation:
-    """Create environments, evaluate a policy in them, and close them.
-
-    Args:
-        policy: the policy, on any device.
-        worlds: arguments of `DroneRacingEnv`.
-        episodes: number of episodes.
-        deterministic: the mode of the policy.
-        num_envs: see `Course`.
-        recording: arguments of `evaluate`: ``num_trajectories``, ``max_recorded_steps``, ``record_pixels``.
-    """
+    """Create environments, evaluate a policy in them, and close them; arguments as in `Course` and `evaluate`."""
     course = Course(policy, worlds, episodes, num_envs)
     try:
         return course.evaluate(deterministic, **recording)
@@ -201,17 +184,12 @@ def report_heading(title: str, provenance: dict[str, Any]) -> str:
 
 
 def results_table(results: Sequence[Result], condition: str = "condition") -> str:
-    """Return a Markdown table with one row per result.
-
-    Args:
-        results: the results.
-        condition: head of the column of conditions.
-    """
+    """Return a Markdown table with one row per result; ``condition`` is the head of the column of conditions."""
     head = (
         "physics", condition, "policy", "success", "gates", "best lap (s)", "mean lap (s)", "top speed (m/s)",
         "mean speed (m/s)", "gate offset (m)", "action change", "crashes",
     )  # fmt: skip
-    rows = [head, ("---",) * len(head)]
+    rows = []
     for result in results:
         flown = result.evaluation
         rows.append(
@@ -230,12 +208,16 @@ def results_table(results: Sequence[Result], condition: str = "condition") -> st
                 crashes_in_words(flown),
             )
         )
-    return as_markdown(rows)
+    return as_markdown(head, rows)
 
 
-def as_markdown(rows: Sequence[Sequence[str]]) -> str:
-    """Return the rows of a table in Markdown."""
-    return "\n".join("| " + " | ".join(row) + " |" for row in rows) + "\n"
+def _number(value: float | None) -> str:
+    return "–" if value is None else f"{value:.2f}"
+
+
+def as_markdown(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
+    """Return a table in Markdown."""
+    return "\n".join("| " + " | ".join(row) + " |" for row in (head, ["---"] * len(head), *rows)) + "\n"
 
 
 def crashes_in_words(evaluation: Evaluation) -> str:
@@ -246,7 +228,3 @@ def crashes_in_words(evaluation: Evaluation) -> str:
         if places:
             words.append(f"{cause.replace('_', ' ')}: {', '.join(places)}")
     return "; ".join(words) or "none"
-
-
-def _number(value: float | None) -> str:
-    return "–" if value is None else f"{value:.2f}"

@@ -75,13 +75,7 @@ class Sight:
 def measure_sight(
     trajectories: Sequence[Trajectory], track: Track, camera: Camera, decoys: Sequence[Gate] = ()
 ) -> dict[str, Sight]:
-    """Measure which gates and decoys the camera was pointed at, over all observations of some flights.
-
-    Args:
-        trajectories: the flights.
-        track: the track with the race gates.
-        camera: the nose camera.
-        decoys: poses of the decoys, or poses at which decoys could stand.
+    """Measure which gates and decoys, or places of decoys, the camera was pointed at, over all observations of flights.
 
     Returns:
         One `Sight` per object. ``next gate``: the gate to pass next. ``nearest visible gate``: the race gate in view
@@ -136,13 +130,9 @@ def angles(points: Tensor) -> Tensor:
 
 
 def sight_table(flights: Mapping[str, Mapping[str, Sight]]) -> str:
-    """Return a Markdown table of shares in view and angles, without the numbered race gates (see `gate_table`).
-
-    Args:
-        flights: results of `measure_sight`, by the name of the kind of flight.
-    """
+    """Return a Markdown table of results of `measure_sight` by kind of flight, without the numbered race gates."""
     head = ("flights", "object", "in view", "angle: mean", *(f"{level} %" for level in QUANTILES))
-    rows = [head, ("---",) * len(head)]
+    rows = []
     for flight, sights in flights.items():
         for name, sight in sights.items():
             if is_race_gate(name):
@@ -151,20 +141,14 @@ def sight_table(flights: Mapping[str, Mapping[str, Sight]]) -> str:
             values = [numbers["angle_mean_degrees"], *numbers["angle_quantiles_degrees"].values()]
             cells = ("–" if value is None else f"{value:.0f}°" for value in values)
             rows.append((flight, name, f"{sight.share_in_view:.0%}", *cells))
-    return as_markdown(rows)
+    return as_markdown(head, rows)
 
 
 def gate_table(flights: Mapping[str, Mapping[str, Sight]]) -> str:
-    """Return a Markdown table of the share of time that each race gate was in view, one row per gate.
-
-    Args:
-        flights: results of `measure_sight` on tracks with the same race gates, by the name of the kind of flight.
-    """
+    """Return a Markdown table of the share of time that each race gate was in view, on tracks with the same gates."""
     gates = dict.fromkeys(name for sights in flights.values() for name in sights if is_race_gate(name))
-    head = ("in view", *flights)
-    rows = [head, ("---",) * len(head)]
-    rows += [(gate, *(f"{sights[gate].share_in_view:.0%}" for sights in flights.values())) for gate in gates]
-    return as_markdown(rows)
+    rows = [(gate, *(f"{sights[gate].share_in_view:.0%}" for sights in flights.values())) for gate in gates]
+    return as_markdown(("in view", *flights), rows)
 
 
 @dataclass

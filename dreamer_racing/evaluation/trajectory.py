@@ -11,8 +11,9 @@ import os
 import zipfile
 import zlib
 from collections import defaultdict
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -40,8 +41,12 @@ TILT = "camera_tilt"
 """Name of an optional header line after those of `HEAD`: the camera's tilt, if known."""
 VALUE = "value"
 """Name of an optional column after the action: the critic's value, if the flight has one."""
+OF_STEPS = ("action", VALUE)
+"""Fields with a row per step; others have one per observation."""
 NUMBERS, IMAGES = "_trajectory.csv", "_onboard.npz"
 """File name suffixes of the numbers and images of a flight."""
+BROKEN_NPZ = (ValueError, KeyError, EOFError, zipfile.BadZipFile, zlib.error)
+"""What reading an `.npz` file raises if it is of another kind or incomplete."""
 
 
 @dataclass(frozen=True)
@@ -78,26 +83,35 @@ class Trajectory:
         """(K + 1,) speed, m/s."""
         return self.linear_velocity.norm(dim=-1)
 
-    def part(self, first: int, last: int) -> Trajectory:
-        """Return rows ``first`` to ``last``, inclusive; the outcome is None if the last row is left out."""
-        rows = {name: getattr(self, name)[first : last + 1] for name in ("position", "attitude", "linear_velocity")}
-        return Trajectory(
-            **rows,
-            target_gate=self.target_gate[first : last + 1],
-            action=self.action[first:last],
-            pixels=None if self.pixels is None else self.pixels[first : last + 1],
-            control_dt=self.control_dt,
-            outcome=self.outcome if last >= len(self.position) - 1 else None,
-            value=None if self.value is None else self.value[first:last],
-            camera_tilt=self.camera_tilt,
-            imu=None if self.imu is None else self.imu[first : last + 1],
-            vector=None if self.vector is None else self.vector[first : last + 1],
-        )
+    @property
+    def duration(self) -> float:
+        """Time from the first row to the last, s."""
+        return (len(self.position) - 1) * self.control_dt
+
+    @property
+    def gates_passed(self) -> int:
+        """Number of steps that changed the gate to pass next."""
+        return int((self.target_gate.diff() != 0).sum())
 
     @property
     def crashed(self) -> bool:
         """Whether the episode ended in a crash."""
         return self.outcome in CRASHES
+
+    @property
+    def ending(self) -> str:
+        """The outcome in words."""
+        return (self.outcome or "recording stopped").replace("_", " ")
+
+    def part(self, first: int, last: int) -> Trajectory:
+        """Return rows ``first`` to ``last``, inclusive; the outcome is None if the last row is left out."""
+        values = {field.name: getattr(self, field.name) for field in fields(self)}
+        rows: dict[str, Any] = {
+            name: value[first : last + (name not in OF_STEPS)]
+            for name, value in values.items()
+            if isinstance(value, Tensor)
+        }
+        return replace(self, **rows, outcome=self.outcome if last >= len(self.position) - 1 else None)
 
 
 class TrajectoryRecorder:
@@ -106,24 +120,21 @@ class TrajectoryRecorder:
     Args:
         root: the tensordict after the reset, batch size [N].
         count: M, at most N.
-        max_steps: maximum of K.
         pixels: whether to record ``pixels``, ``imu`` and ``vector``, if present.
     """
 
-    def __init__(self, root: TensorDictBase, count: int, max_steps: float, pixels: bool = True) -> None:
-        self._max_steps = max_steps
+    def __init__(self, root: TensorDictBase, count: int, pixels: bool = True) -> None:
         self._pixels = pixels
         self._rows: dict[str, list[Tensor]] = defaultdict(list)  # each (M, ...)
         self._lengths = [0] * count
         self._outcomes: list[str | None] = [None] * count
-        self._running = [True] * count
         if count:
             self._observe(root)
 
     @property
     def running(self) -> bool:
         """Whether an episode is still being recorded."""
-        return any(self._running)
+        return None in self._outcomes
 
     def add(self, step: TensorDictBase, outcomes: Sequence[str | None], value: Tensor | None = None) -> None:
         """Record a step: the action at the root and the observation under ``next``.
@@ -139,24 +150,18 @@ class TrajectoryRecorder:
         if value is not None:
             self._rows[VALUE].append(self._copy(value.float().squeeze(-1)))
         self._observe(step["next"])
-        for index, outcome in enumerate(outcomes[: len(self._running)]):
-            if self._running[index]:
+        for index, outcome in enumerate(outcomes[: len(self._outcomes)]):
+            if self._outcomes[index] is None:
                 self._lengths[index] += 1
                 self._outcomes[index] = outcome
-                self._running[index] = outcome is None and self._lengths[index] < self._max_steps
 
     def trajectories(self, control_dt: float, camera_tilt: float | None = None) -> list[Trajectory]:
-        """Return the M recordings.
-
-        Args:
-            control_dt: duration of a step, s.
-            camera_tilt: see `Trajectory`.
-        """
+        """Return the M recordings; arguments as in `Trajectory`."""
         rows = {name: torch.stack(values) for name, values in self._rows.items()}  # each (K [+ 1], M, ...)
         cut = []
         for index, (length, outcome) in enumerate(zip(self._lengths, self._outcomes, strict=True)):
             own: dict[str, Any] = {
-                name: values[: length + (name not in ("action", VALUE)), index].clone() for name, values in rows.items()
+                name: values[: length + (name not in OF_STEPS), index].clone() for name, values in rows.items()
             }  # cloned, so that one recording does not keep the memory of all alive
             own = {"pixels": None, **own, "outcome": outcome}
             cut.append(Trajectory(**own, control_dt=control_dt, camera_tilt=camera_tilt))
@@ -172,28 +177,21 @@ class TrajectoryRecorder:
 
     def _copy(self, value: Tensor) -> Tensor:
         """Copy (N, ...) → (M, ...) to the CPU."""
-        return value[: len(self._running)].to("cpu", copy=True)
+        return value[: len(self._outcomes)].to("cpu", copy=True)
 
 
 def write_trajectory(path: str | Path, trajectory: Trajectory, track: str | Path | Track) -> None:
     """Write an episode as CSV, atomically, with one row per observation, K + 1 in all.
 
     A row holds the observation, and the action and any critic's value at it. Numbers are exact to the last bit; images,
-    ``imu`` and ``vector`` are left out. Header lines begin with `#`.
-
-    Args:
-        path: the file; missing folders are created.
-        trajectory: the episode.
-        track: the track, in a form that `load_track` accepts; the file holds its full description.
+    ``imu`` and ``vector`` are left out. Header lines begin with `#`; one holds the track's full description.
     """
     fields = [getattr(trajectory, name).reshape(len(trajectory.position), -1).tolist() for name in STATE]
     steps, names = trajectory.action, [f"a{index}" for index in range(trajectory.action.shape[1])]
     if trajectory.value is not None:
         steps, names = torch.cat((steps, trajectory.value[:, None]), dim=1), [*names, VALUE]
     actions = [*steps.tolist(), [""] * len(names)]  # the last observation has no action
-    Path(path).parent.mkdir(parents=True, exist_ok=True)
-    partial = Path(path).with_name(f".{Path(path).name}.partial")
-    with partial.open("w", newline="", encoding="utf-8") as file:
+    with swapped_in(path) as partial, partial.open("w", newline="", encoding="utf-8") as file:
         course = json.dumps(describe_track(load_track(track)))
         head = (course, repr(trajectory.control_dt), trajectory.outcome or "none")
         file.writelines(f"# {name}: {value}\n" for name, value in zip(HEAD, head, strict=True))
@@ -204,14 +202,26 @@ def write_trajectory(path: str | Path, trajectory: Trajectory, track: str | Path
         writer.writerow(["t", *columns, *names])
         for index, row in enumerate(zip(*fields, actions, strict=True)):
             writer.writerow([f"{index * trajectory.control_dt:.6g}", *(_text(cell) for cells in row for cell in cells)])
-    os.replace(partial, path)
+
+
+@contextmanager
+def swapped_in(path: str | Path) -> Iterator[Path]:
+    """Yield a temporary path with the suffix of a file, and replace the file by it when the block succeeds.
+
+    Missing folders are created. The file is unchanged if the block fails.
+    """
+    path = Path(path)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    partial = path.with_name(f".{path.name}.partial{path.suffix}")
+    try:
+        yield partial
+        os.replace(partial, path)
+    finally:
+        partial.unlink(missing_ok=True)
 
 
 def read_trajectory(path: str | Path) -> tuple[Trajectory, Track]:
-    """Read a file written by `write_trajectory`.
-
-    Returns:
-        The episode, without images, and its track.
+    """Read an episode, without images, and its track from a file written by `write_trajectory`.
 
     Raises:
         ValueError: the file is of another kind or truncated.
@@ -251,48 +261,27 @@ def read_trajectory(path: str | Path) -> tuple[Trajectory, Track]:
         value=steps[:, -1] if judged else None,
         camera_tilt=tilt,
     )
-    return trajectory, _read_track(head["track"], path)
-
-
-def _read_track(text: str, path: str | Path) -> Track:
-    """Parse the track in a file's header."""
     try:
-        content = json.loads(text)
+        course = json.loads(head["track"])
     except ValueError as error:
         raise ValueError(f"{path} holds no track: {error}.") from error
-    return read_track(content, str(path))
+    return trajectory, read_track(course, str(path))
 
 
 def write_flight(stem: str | Path, trajectory: Trajectory, track: str | Path | Track) -> list[str]:
-    """Write an episode as `<stem>_trajectory.csv` and its images, if any, as `<stem>_onboard.npz`.
-
-    Args:
-        stem: path of both files without the suffix.
-        trajectory: the episode.
-        track: the track, in a form that `load_track` accepts.
-
-    Returns:
-        The files' names.
-    """
+    """Write an episode as `<stem>_trajectory.csv` and its images, if any, as `<stem>_onboard.npz`; return the names."""
     numbers, images = _files(stem)
     images.unlink(missing_ok=True)  # of an earlier flight with the same name
     write_trajectory(numbers, trajectory, track)
     if trajectory.pixels is None:
         return [numbers.name]
-    partial = images.with_name(f".{images.name}.partial.npz")
-    np.savez_compressed(partial, pixels=trajectory.pixels.numpy())
-    os.replace(partial, images)
+    with swapped_in(images) as partial:
+        np.savez_compressed(partial, pixels=trajectory.pixels.numpy())
     return [numbers.name, images.name]
 
 
 def read_flight(path: str | Path) -> tuple[Trajectory, Track]:
-    """Read files written by `write_flight` or `write_trajectory`.
-
-    Args:
-        path: path of the numbers, `*_trajectory.csv`.
-
-    Returns:
-        The episode, with the images if their file is in the same folder, and its track.
+    """Read an episode and its track from `*_trajectory.csv`, with the images if their file is in the same folder.
 
     Raises:
         ValueError: a file is of another kind or truncated, or the images belong to another flight.
@@ -305,7 +294,7 @@ def read_flight(path: str | Path) -> tuple[Trajectory, Track]:
     try:
         with np.load(images) as file:
             pixels = torch.from_numpy(file["pixels"])
-    except (ValueError, KeyError, EOFError, zipfile.BadZipFile, zlib.error) as error:
+    except BROKEN_NPZ as error:
         raise ValueError(f"{images} holds no images of a flight, or only some of them: {error}.") from error
     if pixels.ndim != 4 or len(pixels) != len(trajectory.position) or pixels.dtype != torch.uint8:
         raise ValueError(

@@ -25,15 +25,12 @@ def make_learner(**config) -> DreamerV3:
 
 def make_batch(windows: int, length: int = SEEN + HORIZON) -> TensorDict:
     """Windows of one episode without an end, and a reward of 0."""
-    generator = torch.Generator().manual_seed(0)
-    flag = torch.zeros(windows, length, 1, dtype=torch.bool)
+    generator, none = torch.Generator().manual_seed(0), torch.zeros(windows, length, 1)
     fields = {
         "vector": torch.randn(windows, length, 3, generator=generator),
         "previous_action": torch.rand(windows, length, 4, generator=generator) * 2 - 1,
-        "reward": torch.zeros(windows, length, 1),
-        "is_init": flag.clone(),
-        "terminated": flag.clone(),
-        "truncated": flag.clone(),
+        "reward": none,
+        **{flag: none.bool() for flag in ("is_init", "terminated", "truncated")},
     }
     return TensorDict(fields, [windows, length])
 
@@ -57,29 +54,20 @@ IMAGINED = REWARD + DISCOUNT * CONTINUATION * REWARD + DISCOUNT**2 * CONTINUATIO
 FIRST, SECOND = SEEN, SEEN + 1  # records of the horizon
 
 
-@pytest.mark.parametrize(
-    ("ends", "real", "reward_error"),
-    [
-        ({}, 1 + DISCOUNT * 2 + DISCOUNT**2 * VALUE, 3 - 2 * REWARD),
-        ({"terminated": SEEN - 1}, None, None),
-        ({"truncated": SEEN - 1, "is_init": FIRST}, None, None),
-        ({"truncated": FIRST, "is_init": SECOND}, None, 1 - REWARD),
-        ({"is_init": FIRST}, 0.0, 0.0),
-        ({"terminated": FIRST, "is_init": SECOND}, 1.0, 1 - REWARD),
-        ({"terminated": SECOND}, 1 + DISCOUNT * 2, 3 - 2 * REWARD),
-        ({"is_init": SEEN - 1}, 1 + DISCOUNT * 2 + DISCOUNT**2 * VALUE, 3 - 2 * REWARD),
-    ],
-    ids=[
-        "goes on",
-        "terminated start",
-        "truncated start",
-        "truncated inside",
-        "next episode",
-        "ends after one",
-        "terminates last",
-        "begins at the start",
-    ],
-)
+GOES_ON = 1 + DISCOUNT * 2 + DISCOUNT**2 * VALUE
+ENDS = {
+    "goes on": ({}, GOES_ON, 3 - 2 * REWARD),
+    "terminated start": ({"terminated": SEEN - 1}, None, None),
+    "truncated start": ({"truncated": SEEN - 1, "is_init": FIRST}, None, None),
+    "truncated inside": ({"truncated": FIRST, "is_init": SECOND}, None, 1 - REWARD),
+    "next episode": ({"is_init": FIRST}, 0.0, 0.0),
+    "ends after one": ({"terminated": FIRST, "is_init": SECOND}, 1.0, 1 - REWARD),
+    "terminates last": ({"terminated": SECOND}, 1 + DISCOUNT * 2, 3 - 2 * REWARD),
+    "begins at the start": ({"is_init": SEEN - 1}, GOES_ON, 3 - 2 * REWARD),
+}
+
+
+@pytest.mark.parametrize(("ends", "real", "reward_error"), ENDS.values(), ids=ENDS)
 def test_real_returns_by_hand(
     predictable: DreamerV3, ends: dict[str, int], real: float | None, reward_error: float | None
 ) -> None:
@@ -130,18 +118,12 @@ def test_measuring_leaves_no_trace(measure: Callable, mixed_precision: bool) -> 
     assert torch.equal(torch.rand(4), expected)
     prefix = "held_out/" if measure is held_out_metrics else ""
     assert {prefix + name for name in ("reward_error", "loss_vector", "kl", "loss_reward")} <= metrics.keys()
-    if measure is held_out_metrics:
-        assert {
-            "held_out/open_loop_reward_error", "held_out/open_loop_correlation",
-            "imagination/return_correlation", "imagination/return_bias",
-        } <= metrics.keys()  # fmt: skip
     for key, value in metrics.items():
         assert value.shape == () and value.isfinite() and not value.requires_grad, key
         assert value.dtype == torch.float32, key
     for name, value in learner.agent.state_dict().items():
         assert torch.equal(value, before["agent"][name]), name
     assert all(parameter.grad is None for parameter in learner.agent.parameters())
-    assert learner.updates == 0
 
 
 def test_only_context_and_horizon_count() -> None:
