@@ -9,11 +9,12 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 import torch
 from matplotlib.axes import Axes
+from matplotlib.cm import ScalarMappable
 from matplotlib.collections import LineCollection
 from matplotlib.colors import Colormap, LinearSegmentedColormap, Normalize
 from matplotlib.figure import Figure
@@ -26,23 +27,22 @@ from dreamer_racing.envs.simulator.scene import Camera
 from dreamer_racing.envs.tracks import Gate, Track
 from dreamer_racing.evaluation.trajectory import Trajectory
 
+Style = dict[str, Any]
+"""Options of matplotlib."""
 GATE_COLOR = "#e8590c"
 DECOY_COLOR = "#c2255c"
 INK, MUTED, FAINT = "#212529", "#868e96", "#dee2e6"
 CRASH_COLOR = "#e03131"
-CRASH: dict[str, Any] = {"marker": "x", "markersize": 11, "color": CRASH_COLOR, "markeredgewidth": 2.6}
+CRASH: Style = {"marker": "x", "markersize": 11, "color": CRASH_COLOR, "markeredgewidth": 2.6}
 """Marker of a crash: a cross behind the path, so that the end of a short flight stays visible."""
-START: dict[str, Any] = {
-    "marker": "o",
-    "markersize": 9,
-    "color": "white",
-    "markeredgecolor": "#212529",
-    "markeredgewidth": 1.8,
-}
+START: Style = {"marker": "o", "markersize": 9, "color": "white", "markeredgecolor": INK, "markeredgewidth": 1.8}
 """Marker of a start: a ring behind the path."""
 SPEED_COLORS: Colormap = LinearSegmentedColormap.from_list(
     "speed", ["#3b1f6b", "#2f5fb3", "#1fa2a6", "#7bc043", "#f2b705"]
 )
+BADGE: Style = {"boxstyle": "circle,pad=0.22", "facecolor": "white", "edgecolor": GATE_COLOR, "linewidth": 1.0}
+DASHED = (0, (5, 3))
+BOX: Style = {"facecolor": "#f8f9fa", "edgecolor": MUTED, "linewidth": 1.0, "linestyle": DASHED, "zorder": 0}
 ARROW_INTERVAL = 0.1  # s between camera arrows
 ARROW_LENGTH = 0.6  # m
 NOTE_LETTERS = 14  # letters of a note per inch of a figure's width
@@ -54,35 +54,22 @@ def speed_scale(trajectories: Sequence[Trajectory]) -> Normalize:
     return Normalize(0.0, max(1.0, math.ceil(top)))
 
 
-def draw_flight(
-    axes: Axes,
-    trajectory: Trajectory,
-    speed: Normalize,
-    plane: tuple[int, int] = (0, 1),
-    tilt: float | None = None,
-) -> None:
-    """Draw a path coloured by speed, the camera's directions along it, its start, and a crash at its end.
-
-    Args:
-        axes: axes with the track from `draw_track`.
-        trajectory: the flight.
-        speed: colour scale.
-        plane: the two world axes shown.
-        tilt: tilt of the camera, degrees; None for the flight's own.
-    """
+def draw_flight(axes: Axes, trajectory: Trajectory, speed: Normalize, plane: tuple[int, int] = (0, 1)) -> None:
+    """Draw a path coloured by speed in the plane of two world axes, the camera's directions, start, and any crash."""
     _draw_path(axes, trajectory, plane, speed)
-    _draw_cameras(axes, trajectory, plane, tilt_of(trajectory) if tilt is None else tilt)
+    _draw_cameras(axes, trajectory, plane)
     _draw_ends(axes, trajectory, plane)
 
 
-def draw_track(axes: Axes, track: Track, labels: bool = True) -> None:
-    """Draw a track from above with its bounding box, gates and decoys, at equal scales on both axes.
+def draw_speed_scale(figure: Figure, panels: Sequence[Axes], speed: Normalize, label: str = "speed (m/s)") -> None:
+    """Draw the colour scale of speeds beside panels."""
+    bar = figure.colorbar(ScalarMappable(speed, SPEED_COLORS), ax=panels, shrink=0.6, aspect=35, pad=0.01)
+    bar.set_label(label)
+    bar.outline.set_visible(False)
 
-    Args:
-        axes: axes to draw on.
-        track: the track.
-        labels: whether to number gates and label axes.
-    """
+
+def draw_track(axes: Axes, track: Track, labels: bool = True) -> None:
+    """Draw a track from above at equal scales: its bounding box, decoys, and gates, by default numbered."""
     (x_low, y_low, _), (x_high, y_high, _) = track.bounds_low, track.bounds_high
     axes.add_patch(Rectangle((x_low, y_low), x_high - x_low, y_high - y_low, **BOX))
     for gate in track.decoys:
@@ -99,12 +86,9 @@ def draw_track(axes: Axes, track: Track, labels: bool = True) -> None:
 
 
 def save(figure: Figure, path: str | Path, left_out: Sequence[str] = ()) -> None:
-    """Write a figure, and a text file that names what was left out of it.
+    """Write a figure into a folder that may not exist yet, and what was left out of it into `left_out_of(path)`.
 
-    Args:
-        figure: the figure.
-        path: the file; missing folders are created.
-        left_out: lines of the text file `left_out_of(path)`. If empty, such a file of an earlier figure is removed.
+    If nothing was left out, such a file of an earlier figure is removed.
     """
     Path(path).parent.mkdir(parents=True, exist_ok=True)
     figure.savefig(path, dpi=150, facecolor="white")
@@ -119,10 +103,10 @@ def left_out_of(path: str | Path) -> Path:
     return Path(path).with_name(f"{Path(path).stem}_left_out.txt")
 
 
-def dress(axes: Axes) -> None:
+def dress(axes: Axes, grid: Literal["both", "x", "y"] = "both") -> None:
     """Draw a faint grid without frame and ticks."""
     axes.set_axisbelow(True)
-    axes.grid(color=FAINT, linewidth=0.6)
+    axes.grid(axis=grid, color=FAINT, linewidth=0.6)
     axes.tick_params(colors=MUTED, labelsize=8, length=0)
     axes.spines[:].set_visible(False)
 
@@ -141,33 +125,15 @@ def tilt_of(trajectory: Trajectory) -> float:
 
 
 def camera_directions(attitude: torch.Tensor, tilt: float = Camera.tilt) -> torch.Tensor:
-    """Return the directions of the nose camera.
+    """Return the directions of the nose camera, (..., 3) unit vectors in the world.
 
     Args:
         attitude: (..., 4) unit quaternions wxyz, body → world.
         tilt: tilt of the camera upwards from the body's x axis, degrees.
-
-    Returns:
-        (..., 3) unit vectors in the world.
     """
     angle = math.radians(tilt)
     axis = torch.tensor((math.cos(angle), 0.0, math.sin(angle)), dtype=attitude.dtype)
     return rotate(attitude, axis.expand(*attitude.shape[:-1], 3))
-
-
-BADGE: dict[str, Any] = {
-    "boxstyle": "circle,pad=0.22",
-    "facecolor": "white",
-    "edgecolor": GATE_COLOR,
-    "linewidth": 1.0,
-}
-BOX: dict[str, Any] = {
-    "facecolor": "#f8f9fa",
-    "edgecolor": MUTED,
-    "linewidth": 1.0,
-    "linestyle": (0, (5, 3)),
-    "zorder": 0,
-}
 
 
 def dress_map(axes: Axes, y_label: str | None) -> None:
@@ -215,26 +181,14 @@ def _draw_path(axes: Axes, trajectory: Trajectory, plane: tuple[int, int], speed
     axes.add_collection(lines, autolim=False)
 
 
-def _draw_cameras(axes: Axes, trajectory: Trajectory, plane: tuple[int, int], tilt: float) -> None:
+def _draw_cameras(axes: Axes, trajectory: Trajectory, plane: tuple[int, int]) -> None:
     """Draw the camera's direction, projected onto the plane, every 0.1 s."""
     every = max(1, round(ARROW_INTERVAL / trajectory.control_dt))
     origin = trajectory.position[::every, list(plane)].numpy()  # (M, 2)
-    direction = camera_directions(trajectory.attitude[::every], tilt)[:, list(plane)].numpy()
-    axes.quiver(
-        *origin.T,
-        *(ARROW_LENGTH * direction).T,
-        angles="xy",
-        scale_units="xy",
-        scale=1.0,
-        units="inches",
-        width=0.010,
-        headwidth=4.5,
-        headlength=5.0,
-        headaxislength=4.5,
-        color=INK,
-        alpha=0.7,
-        zorder=6,
-    )
+    direction = camera_directions(trajectory.attitude[::every], tilt_of(trajectory))[:, list(plane)].numpy()
+    arrow = {"width": 0.010, "headwidth": 4.5, "headlength": 5.0, "headaxislength": 4.5, "color": INK, "alpha": 0.7}
+    scale: Style = {"angles": "xy", "scale_units": "xy", "scale": 1.0, "units": "inches"}
+    axes.quiver(*origin.T, *(ARROW_LENGTH * direction).T, **scale, **arrow, zorder=6)
 
 
 def _draw_ends(axes: Axes, trajectory: Trajectory, plane: tuple[int, int]) -> None:
@@ -246,7 +200,7 @@ def _draw_ends(axes: Axes, trajectory: Trajectory, plane: tuple[int, int]) -> No
 
 def flight_legend(decoys: bool, crash: bool) -> list[Line2D]:
     """Return the legend entries of a flight from above, optionally with decoys and a crash."""
-    bar: dict[str, Any] = {"linewidth": 4.5, "solid_capstyle": "butt"}
+    bar: Style = {"linewidth": 4.5, "solid_capstyle": "butt"}
     handles = [Line2D([], [], color=GATE_COLOR, label="gate", **bar)]
     if decoys:
         handles.append(Line2D([], [], color=DECOY_COLOR, label="decoy", **bar))
@@ -254,5 +208,5 @@ def flight_legend(decoys: bool, crash: bool) -> list[Line2D]:
     if crash:
         handles.append(Line2D([], [], linestyle="", label="crash", **CRASH))
     handles.append(Line2D([], [], color=INK, marker=r"$\rightarrow$", linestyle="", markersize=12, label="camera"))
-    handles.append(Line2D([], [], color=MUTED, linestyle=(0, (5, 3)), linewidth=1.0, label="bounding box"))
+    handles.append(Line2D([], [], color=MUTED, linestyle=DASHED, linewidth=1.0, label="bounding box"))
     return handles

@@ -6,7 +6,7 @@ Shapes: K control steps of an episode.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -17,10 +17,11 @@ from matplotlib.ticker import MaxNLocator
 
 from dreamer_racing.envs.tracks import Gate, Track
 from dreamer_racing.evaluation.trajectory import Trajectory
-from dreamer_racing.figures.drawing import CRASH, FAINT, GATE_COLOR, MUTED, SPEED_COLORS, dress
+from dreamer_racing.figures.drawing import CRASH, DASHED, FAINT, GATE_COLOR, MUTED, SPEED_COLORS, Style, dress
 
 PROFILE_AXES = {"distance": "distance flown (m)", "time": "time (s)"}
-FRAME: dict[str, Any] = {"linewidth": 3.5, "solid_capstyle": "butt", "zorder": 2}
+"""Horizontal axes of profiles, and their labels."""
+FRAME: Style = {"linewidth": 3.5, "solid_capstyle": "butt", "zorder": 2}
 MISSED_COLOR = "#adb5bd"  # of a gate that was crossed on the map but not passed
 HEADROOM = 0.3  # m above the highest thing drawn
 
@@ -57,12 +58,7 @@ def _rows_of_crossing(gate: Gate, reach: float, position: np.ndarray) -> list[fl
 
 
 def profile_axis(trajectory: Trajectory, over: str) -> np.ndarray:
-    """Return the positions of a trajectory's rows on the axis of a profile, (K + 1,), m or s.
-
-    Args:
-        trajectory: the flight.
-        over: ``distance`` or ``time``.
-    """
+    """Return the positions of a trajectory's rows on the axis of a profile, (K + 1,), m or s."""
     if over == "time":
         return np.arange(len(trajectory.position)) * trajectory.control_dt
     steps = np.nan_to_num(np.linalg.norm(np.diff(trajectory.position.numpy(), axis=0), axis=1))  # (K,) m
@@ -70,14 +66,7 @@ def profile_axis(trajectory: Trajectory, over: str) -> np.ndarray:
 
 
 def draw_speed(axes: Axes, trajectory: Trajectory, speed: Normalize, over: str = "distance") -> None:
-    """Draw the speed, coloured by speed, and a numbered line at every gate pass.
-
-    Args:
-        axes: axes to draw on.
-        trajectory: the flight.
-        speed: scale of the colours and of the vertical axis.
-        over: horizontal axis: ``distance`` flown (m) or ``time`` (s).
-    """
+    """Draw the speed, coloured by speed, and a numbered line at every gate pass."""
     along = profile_axis(trajectory, over)
     _draw_profile(axes, trajectory, along, trajectory.speed.numpy(), speed)
     _number_passes(axes, trajectory, along)
@@ -90,14 +79,6 @@ def draw_altitude(
     """Draw the altitude, coloured by speed, and a gate's frame at every crossing of its bar on the map.
 
     The gap in a frame is the opening. Frames of crossings that did not count as a pass are grey.
-
-    Args:
-        axes: axes to draw on.
-        track: the track with the gates.
-        trajectory: the flight.
-        speed: colour scale.
-        over: horizontal axis: ``distance`` flown (m) or ``time`` (s).
-        numbers: whether to number gate passes above the axes.
     """
     along = profile_axis(trajectory, over)
     height = trajectory.position[:, 2].numpy()
@@ -108,7 +89,7 @@ def draw_altitude(
         _number_passes(axes, trajectory, along)
     top = max(gate.position[2] + track.shape.outer / 2 for gate in track.gates)
     axes.axhline(0.0, color=MUTED, linewidth=1.0, zorder=1)
-    axes.axhline(track.bounds_high[2], color=MUTED, linewidth=1.0, linestyle=(0, (5, 3)), zorder=1)
+    axes.axhline(track.bounds_high[2], color=MUTED, linewidth=1.0, linestyle=DASHED, zorder=1)
     axes.set(ylim=(min(0.0, float(np.nanmin(height))), max(top, float(np.nanmax(height))) + HEADROOM))
     axes.set(xlabel=PROFILE_AXES[over], ylabel="altitude (m)")
 
@@ -116,15 +97,9 @@ def draw_altitude(
 def altitude_legend(flights: Sequence[tuple[Track, Trajectory]]) -> list[Line2D]:
     """Return the legend entries of altitude profiles, in addition to `flight_legend`."""
     passed = {crossing.passed for flight in flights for crossing in crossings(*flight)}
-    handles = []
-    if True in passed:
-        handles.append(Line2D([], [], color=GATE_COLOR, label="frame, passed", **_IN_LEGEND))
-    if False in passed:
-        handles.append(Line2D([], [], color=MISSED_COLOR, label="above, below or out of order", **_IN_LEGEND))
-    return handles
-
-
-_IN_LEGEND: dict[str, Any] = {"linestyle": "", "marker": "|", "markersize": 11, "markeredgewidth": 3.5}
+    style: Style = {"linestyle": "", "marker": "|", "markersize": 11, "markeredgewidth": 3.5}
+    looks = ((True, GATE_COLOR, "frame, passed"), (False, MISSED_COLOR, "above, below or out of order"))
+    return [Line2D([], [], color=color, label=label, **style) for which, color, label in looks if which in passed]
 
 
 def _draw_frame(axes: Axes, track: Track, index: int, place: float, passed: bool) -> None:

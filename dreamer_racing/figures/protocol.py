@@ -8,7 +8,6 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.cm import ScalarMappable
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator, PercentFormatter
 
@@ -18,12 +17,13 @@ from dreamer_racing.evaluation.evaluate import CRASHES, FINISHED, Episode, Evalu
 from dreamer_racing.evaluation.protocol import CONDITIONS, MODES, PRESETS, Result, report_heading, results_table
 from dreamer_racing.evaluation.sight import BIN_DEGREES, NEAREST_VISIBLE_GATE, Sight, is_race_gate
 from dreamer_racing.figures.drawing import (
-    FAINT,
+    DASHED,
     INK,
     MUTED,
-    SPEED_COLORS,
     draw_flight,
+    draw_speed_scale,
     draw_track,
+    dress,
     from_zero,
     save,
     speed_scale,
@@ -37,6 +37,8 @@ CAUSE_COLORS = dict(
 )
 Z95 = 1.96  # half-width of the central 95 % of a normal distribution, in standard deviations
 SIGHT_COLORS = ("#6f9be0", "#7bc043", "#c2255c")
+Flights = Mapping[str, tuple[Track, Trajectory, Mapping[str, Sight]]]
+"""Track, one flight, and the sights over all flights, by name, such as ``without decoys``."""
 
 
 class Bar(NamedTuple):
@@ -60,11 +62,9 @@ def share_bar(happened: Sequence[bool]) -> Bar:
 
 
 def mean_bar(values: Sequence[float], height: float | None = None) -> Bar:
-    """Return the mean of non-negative values with its normal interval.
+    """Return the mean of independent non-negative values with its normal interval.
 
-    Args:
-        values: independent samples.
-        height: height of the bar; None for the mean. A mean over samples of different length may need another.
+    Give another ``height`` of the bar where values are means over samples of different length.
     """
     n, mean = len(values), float(np.mean(values)) if height is None else height
     half = Z95 * float(np.std(values, ddof=1)) / np.sqrt(n) if n > 1 else 0.0
@@ -84,14 +84,8 @@ def write_markdown(directory: Path, results: Sequence[Result], provenance: dict[
     (directory / "evaluation.md").write_text(text, encoding="utf-8")
 
 
-def plot_conditions(results: Sequence[Result], path: str | Path, title: str | None = None) -> None:
-    """Draw success rate and gates per episode of each condition, with one bar per mode of the policy.
-
-    Args:
-        results: results of the protocol.
-        path: the file to write; missing folders are created.
-        title: title of the figure.
-    """
+def plot_conditions(results: Sequence[Result], path: str | Path, title: str) -> None:
+    """Draw success rate and gates per episode of each condition, with one bar per mode of the policy."""
     places = list(dict.fromkeys((result.preset, result.condition) for result in results))
     figure = Figure(figsize=(max(9.0, 1.2 * len(places)), 6.4), layout="constrained")
     success, gates = figure.subplots(2, 1, sharex=True)
@@ -101,7 +95,7 @@ def plot_conditions(results: Sequence[Result], path: str | Path, title: str | No
             bars = {(r.preset, r.condition): measure(r.evaluation) for r in results if r.mode == mode}
             at = [number + (index - 0.5) * 0.4 for number, place in enumerate(places) if place in bars]
             shown = [bars[place] for place in places if place in bars]
-            _draw_bars(axes, np.array(at), shown, MODE_COLORS[mode], mode, form=form)
+            _draw_bars(axes, np.array(at), shown, MODE_COLORS[mode], mode, form)
         _dress(axes, name)
     _share_axis(success)
     from_zero(gates)
@@ -109,7 +103,8 @@ def plot_conditions(results: Sequence[Result], path: str | Path, title: str | No
     labels = [f"{condition.replace('_', ' ')}\n{preset}" for preset, condition in places]
     gates.set_xticks(range(len(places)), labels, fontsize=8)
     success.legend(frameon=False, fontsize=8, ncols=2, loc="upper right", bbox_to_anchor=(1.0, 1.16))
-    _note(figure, "Lines: 95 % intervals over n different flights (success: Wilson, mean gates: normal).")
+    note = "Lines: 95 % intervals over n different flights (success: Wilson, mean gates: normal)."
+    figure.supxlabel(note, x=0.01, ha="left", fontsize=8, color=MUTED)
     _save(figure, path, title)
 
 
@@ -126,14 +121,8 @@ def _distinct(evaluation: Evaluation) -> list[Episode]:
     return list({repr(episode): episode for episode in evaluation.episodes}.values())
 
 
-def plot_crashes(flown: Mapping[str, Evaluation], path: str | Path, title: str | None = None) -> None:
-    """Draw the number of crashes by next gate and cause, with one panel per evaluation.
-
-    Args:
-        flown: evaluations by name, on tracks with the same number of gates.
-        path: the file to write; missing folders are created.
-        title: title of the figure.
-    """
+def plot_crashes(flown: Mapping[str, Evaluation], path: str | Path, title: str) -> None:
+    """Draw the number of crashes by next gate and cause, with one panel per evaluation on tracks of as many gates."""
     figure = Figure(figsize=(9.0, 3.4), layout="constrained")
     panels = figure.subplots(1, len(flown), sharey=True, squeeze=False)[0]
     shown: set[str] = set()
@@ -159,19 +148,10 @@ def plot_crashes(flown: Mapping[str, Evaluation], path: str | Path, title: str |
     _save(figure, path, title)
 
 
-def plot_sight(
-    flights: Mapping[str, tuple[Track, Trajectory, Mapping[str, Sight]]],
-    camera: Camera,
-    path: str | Path,
-    title: str | None = None,
-) -> None:
+def plot_sight(flights: Flights, camera: Camera, path: str | Path, title: str) -> None:
     """Draw where the camera pointed: flights from above, distributions of angles, and shares of time in view.
 
-    Args:
-        flights: track, one flight, and the sights over all flights, by name (``without decoys``); tracks have one size.
-        camera: the nose camera.
-        path: the file to write; missing folders are created.
-        title: title of the figure.
+    The tracks have one size.
     """
     columns, track = len(flights), next(iter(flights.values()))[0]
     width, depth = (high - low for low, high in zip(track.bounds_low[:2], track.bounds_high[:2], strict=True))
@@ -180,7 +160,15 @@ def plot_sight(
     figure = Figure(figsize=(10.0, sum(rows) + 2.6), layout="constrained")
     grid = figure.add_gridspec(4, columns, height_ratios=rows)
     maps, profiles, below = ([figure.add_subplot(grid[row, column]) for column in range(columns)] for row in range(3))
-    _draw_maps(figure, maps, profiles, flights, camera)
+    speed = speed_scale([trajectory for _, trajectory, _ in flights.values()])
+    for axes, profile, (name, (track, trajectory, _)) in zip(maps, profiles, flights.items(), strict=True):
+        draw_track(axes, track)
+        draw_flight(axes, trajectory, speed)
+        axes.set_title(name, loc="left", fontsize=10, color=INK)
+        draw_altitude(profile, track, trajectory, speed)
+    for axes in (*maps[1:], *profiles[1:]):
+        axes.set_ylabel("")
+    draw_speed_scale(figure, [*maps, *profiles], speed, "speed (m/s); arrows: camera")
     for axes, (name, (_, _, sights)) in zip(below, flights.items(), strict=True):
         _draw_distributions(axes, name, sights, camera)
         axes.sharey(below[0])
@@ -194,33 +182,13 @@ def plot_sight(
     _save(figure, path, title)
 
 
-def _draw_maps(
-    figure: Figure,
-    maps: Sequence[Axes],
-    profiles: Sequence[Axes],
-    flights: Mapping[str, tuple[Track, Trajectory, Mapping[str, Sight]]],
-    camera: Camera,
-) -> None:
-    speed = speed_scale([trajectory for _, trajectory, _ in flights.values()])
-    for axes, below, (name, (track, trajectory, _)) in zip(maps, profiles, flights.items(), strict=True):
-        draw_track(axes, track)
-        draw_flight(axes, trajectory, speed, tilt=camera.tilt)
-        axes.set_title(name, loc="left", fontsize=10, color=INK)
-        draw_altitude(below, track, trajectory, speed)
-    for axes in (*maps[1:], *profiles[1:]):
-        axes.set_ylabel("")
-    bar = figure.colorbar(ScalarMappable(speed, SPEED_COLORS), ax=[*maps, *profiles], shrink=0.7, aspect=30, pad=0.01)
-    bar.set_label("speed (m/s); arrows: camera", fontsize=8)
-    bar.outline.set_visible(False)
-
-
 def _draw_distributions(axes: Axes, name: str, sights: Mapping[str, Sight], camera: Camera) -> None:
     edges = np.arange(0, 180 + BIN_DEGREES, BIN_DEGREES)
     single = {thing for thing in sights if thing.startswith("decoy ") or is_race_gate(thing)}  # left out
     drawn = {thing: sight for thing, sight in sights.items() if thing not in single}
     for color, (thing, sight) in zip(SIGHT_COLORS, drawn.items(), strict=False):
         axes.stairs(sight.histogram().numpy(), edges, color=color, label=thing, linewidth=1.6, fill=False)
-    axes.axvline(camera.field_of_view / 2, color=MUTED, linewidth=1.0, linestyle=(0, (5, 3)))
+    axes.axvline(camera.field_of_view / 2, color=MUTED, linewidth=1.0, linestyle=DASHED)
     _dress(axes, f"{name}: angle between camera axis and …")
     axes.set(xlim=(0, 180), xlabel="degrees; dashed: half the field of view")
     axes.xaxis.set_major_locator(MaxNLocator(6, steps=[3, 6]))
@@ -236,7 +204,7 @@ def _draw_shares(axes: Axes, flights: Mapping[str, Mapping[str, Sight]]) -> None
             number + (index - (len(flights) - 1) / 2) * width for number, thing in enumerate(things) if thing in sights
         ]
         bars = [mean_bar(s.shares_by_flight, s.share_in_view) for s in (sights[t] for t in things if t in sights)]
-        _draw_bars(axes, np.array(at), bars, SIGHT_COLORS[index], name, width, "{:.0%}")
+        _draw_bars(axes, np.array(at), bars, SIGHT_COLORS[index], name, "{:.0%}", width)
     labels = ["any gate" if thing == NEAREST_VISIBLE_GATE else thing for thing in things]
     axes.set_xticks(range(len(things)), labels, fontsize=8)
     axes.set_xlim(-0.6, len(things) - 0.4)
@@ -253,13 +221,7 @@ def _share_axis(axes: Axes) -> None:
 
 
 def _draw_bars(
-    axes: Axes,
-    places: np.ndarray,
-    bars: Sequence[Bar],
-    color: str,
-    label: str,
-    width: float = 0.4,
-    form: str = "{:.2g}",
+    axes: Axes, places: np.ndarray, bars: Sequence[Bar], color: str, label: str, form: str, width: float = 0.4
 ) -> None:
     """Draw bars with their intervals, and write value and n above."""
     heights = np.array([bar.height for bar in bars])
@@ -272,19 +234,11 @@ def _draw_bars(
         axes.annotate(words, at, (0, 3), textcoords="offset points", ha="center", va="bottom", fontsize=7, color=INK)
 
 
-def _note(figure: Figure, text: str) -> None:
-    figure.supxlabel(text, x=0.01, ha="left", fontsize=8, color=MUTED)
-
-
 def _dress(axes: Axes, title: str) -> None:
     axes.set_title(title, loc="left", fontsize=10, color=INK)
-    axes.set_axisbelow(True)
-    axes.grid(axis="y", color=FAINT, linewidth=0.6)
-    axes.tick_params(colors=MUTED, labelsize=8, length=0)
-    axes.spines[:].set_visible(False)
+    dress(axes, "y")
 
 
-def _save(figure: Figure, path: str | Path, title: str | None) -> None:
-    if title:
-        figure.suptitle(title, x=0.02, ha="left", fontsize=11, color=INK)
+def _save(figure: Figure, path: str | Path, title: str) -> None:
+    figure.suptitle(title, x=0.02, ha="left", fontsize=11, color=INK)
     save(figure, path)

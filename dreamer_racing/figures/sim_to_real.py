@@ -31,11 +31,7 @@ NOTE = "Lines: 95 % intervals over n flights (success: Wilson, mean laps: normal
 
 
 def plot_study(results: Sequence[Mapping[str, Any]], path: str | Path) -> None:
-    """Draw studies side by side: the share of finished flights above, the mean lap time of flights with a lap below.
-
-    Args:
-        results: Results of recipes/sim_to_real.py, one per flyer.
-        path: The file to write.
+    """Draw results of recipes/sim_to_real.py: the share of finished flights above, the mean lap time below.
 
     Raises:
         ValueError: The results hold no flight, or there are more studies than colours.

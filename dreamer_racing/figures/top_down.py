@@ -1,13 +1,13 @@
-"""Figure of one flight from above, with its altitude and, if gates differ in height, a side view."""
+"""Figures of one flight from above, with its altitude and, if gates differ in height, a side view; and of tracks."""
 
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.cm import ScalarMappable
 from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 
@@ -18,8 +18,8 @@ from dreamer_racing.figures.drawing import (
     BOX,
     GATE_COLOR,
     INK,
-    SPEED_COLORS,
     draw_flight,
+    draw_speed_scale,
     draw_track,
     dress_map,
     flight_legend,
@@ -30,19 +30,15 @@ from dreamer_racing.figures.profiles import altitude_legend, draw_altitude
 
 HEIGHT_SPREAD = 0.5  # m between gates, above which a side view is drawn
 PROFILE_HEIGHT = 1.5  # height of the altitude panel, inches
+COLUMNS = 3  # of several tracks
+CELL = (5.0, 5.6)  # width and height per track, inches
 
 
-def plot_top_down(track: Track, trajectory: Trajectory, path: str | Path, title: str | None = None) -> None:
+def plot_top_down(track: Track, trajectory: Trajectory, path: str | Path) -> None:
     """Draw a track and the path of one episode from above, its altitude, and a side view if gates differ in height.
 
     Gates are bars with arrows in the direction of flight and their number in the order of flight; black arrows along
     the path are the camera's direction, as in the paper's figure of perception-aware flight.
-
-    Args:
-        track: the track.
-        trajectory: the path, coloured by speed.
-        path: the file to write; missing folders are created.
-        title: title of the figure; None for the track's name, and the episode's duration, top speed and outcome.
     """
     figure, axes, side, altitude = _layout(track)
     speed = speed_scale([trajectory])
@@ -52,10 +48,10 @@ def plot_top_down(track: Track, trajectory: Trajectory, path: str | Path, title:
         draw_track_side(side, track)
         draw_flight(side, trajectory, speed, plane=(0, 2))
     draw_altitude(altitude, track, trajectory, speed, over="time")
-    bar = figure.colorbar(ScalarMappable(speed, SPEED_COLORS), ax=figure.axes, shrink=0.6, aspect=35, pad=0.01)
-    bar.set_label("speed (m/s)")
-    bar.outline.set_visible(False)
-    axes.set_title(title or _title(track, trajectory), loc="left", fontsize=11, color=INK, pad=8)
+    draw_speed_scale(figure, figure.axes, speed)
+    top = float(np.nanmax(trajectory.speed.numpy()))
+    title = f"{track.name}: {trajectory.duration:.2f} s, up to {top:.1f} m/s ({trajectory.ending})"
+    axes.set_title(title, loc="left", fontsize=11, color=INK, pad=8)
     handles = flight_legend(bool(track.decoys), trajectory.crashed) + altitude_legend([(track, trajectory)])
     figure.legend(handles=handles, loc="outside lower left", ncols=4, frameon=False, fontsize=9)
     save(figure, path)
@@ -91,8 +87,24 @@ def draw_track_side(axes: Axes, track: Track) -> None:
     dress_map(axes, "z (m)")
 
 
-def _title(track: Track, trajectory: Trajectory) -> str:
-    seconds = (len(trajectory.position) - 1) * trajectory.control_dt
-    top = float(np.nanmax(trajectory.speed.numpy()))
-    outcome = (trajectory.outcome or "recording stopped").replace("_", " ")
-    return f"{track.name}: {seconds:.2f} s, up to {top:.1f} m/s ({outcome})"
+def plot_tracks(tracks: Sequence[Track], path: str | Path) -> None:
+    """Draw each track from above and from the side, with gate numbers and the direction of flight.
+
+    Raises:
+        ValueError: there is no track.
+    """
+    if not tracks:
+        raise ValueError("There is no track to draw: give at least one.")
+    columns = min(len(tracks), COLUMNS)
+    rows = math.ceil(len(tracks) / columns)
+    figure = Figure(figsize=(CELL[0] * columns, CELL[1] * rows), layout="constrained")
+    cells = figure.subfigures(rows, columns, squeeze=False).flat
+    for cell, track in zip(cells, tracks, strict=False):  # the last row may have empty cells
+        _, depth, height = (high - low for low, high in zip(track.bounds_low, track.bounds_high, strict=True))
+        above, side = cell.subplots(2, 1, sharex=True, height_ratios=[depth, height])
+        draw_track(above, track)
+        above.set_xlabel("")
+        draw_track_side(side, track)
+        title = f"{track.name}: {track.num_gates} gates, {sum(track.gate_distances):.1f} m"
+        cell.suptitle(title, x=0.02, ha="left", fontsize=11, color=INK)  # not a title of the map, whose height varies
+    save(figure, path)

@@ -7,10 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from matplotlib.container import ErrorbarContainer
-from matplotlib.figure import Figure
-from PIL import Image
 
-from dreamer_racing.figures import sim_to_real
 from dreamer_racing.figures.comparison import compare_variants, comparison_table
 from dreamer_racing.figures.runs import RunData
 from dreamer_racing.figures.sim_to_real import COLORS, LABELS, plot_study
@@ -94,11 +91,6 @@ def test_the_table_says_which_cells_have_fewer_seeds_and_what_was_left_out() -> 
     assert lines[-2] == "- late left out"
 
 
-def test_nothing_to_compare() -> None:
-    with pytest.raises(ValueError, match="no run to compare"):
-        compare_variants([])
-
-
 def test_variants_are_compared_at_equal_cpu_time() -> None:
     """The slow one makes as many env_steps in twice the time: of its gates those up to the other's end count."""
     rising = [float(value) for value in range(1, 11)]
@@ -118,7 +110,9 @@ def test_variants_are_compared_at_equal_cpu_time() -> None:
     assert "| seeds | core_hours |" in table and "| 0.80–1.00 |" in table and "core_hours that every variant" in table
 
 
-def test_an_axis_that_is_not_there_is_refused() -> None:
+def test_nothing_to_compare_and_an_axis_that_is_not_there_are_refused() -> None:
+    with pytest.raises(ValueError, match="no run to compare"):
+        compare_variants([])
     with pytest.raises(ValueError, match="axis=minutes: must be one of env_steps, hours, core_hours"):
         compare_variants(RUNS, axis="minutes")
 
@@ -138,25 +132,11 @@ def test_every_sweep_has_a_label():
     assert LABELS.keys() == SWEEPS.keys()
 
 
-def test_studies_are_drawn_over_each_other(tmp_path):
-    pilot = result("pilot", [flight("mass", 0.9, 4.0), flight("mass", 1.1, None), flight("delay", 0.02, 4.2)])
-    plot_study([pilot, result("circle", [flight("mass", 1.0, 3.3)])], tmp_path / "study.png")
-    width, height = Image.open(tmp_path / "study.png").size
-    assert width > height > 300
-
-
-@pytest.fixture
-def drawn(monkeypatch) -> list[Figure]:
-    """What is drawn, instead of files."""
-    figures: list[Figure] = []
-    monkeypatch.setattr(sim_to_real, "save", lambda figure, path: figures.append(figure))
-    return figures
-
-
-def test_every_point_has_its_interval_and_its_number(drawn):
+def test_every_point_has_its_interval_and_its_number(tmp_path, figures):
     flights = [flight("mass", 0.9, 4.0), flight("mass", 0.9, None), flight("mass", 1.1, None)]
-    plot_study([result("circle", flights)], "study.png")
-    success, laps = drawn[0].axes
+    plot_study([result("circle", flights)], tmp_path / "study.png")
+    assert (tmp_path / "study.png").is_file()
+    success, laps = figures[0].axes
     (share,) = (bars for bars in success.containers if isinstance(bars, ErrorbarContainer))
     assert share.lines[0].get_ydata().tolist() == [0.5, 0.0]
     half, never = (segment[:, 1].tolist() for segment in share.lines[2][0].get_segments())
@@ -167,26 +147,24 @@ def test_every_point_has_its_interval_and_its_number(drawn):
     assert [tick.get_text() for tick in laps.get_xticklabels()] == ["0.9", "1.1"]
 
 
-def test_studies_at_one_value_lie_beside_each_other(drawn):
-    plot_study([result("pilot", [flight("delay", 0.0, 4.0)]), result("circle", [flight("delay", 0.0, 3.0)])], "_.png")
-    places = [bars.lines[0].get_xdata()[0] for bars in drawn[0].axes[0].containers]
+def test_studies_at_one_value_lie_beside_each_other(tmp_path, figures):
+    studies = [result("pilot", [flight("delay", 0.0, 4.0)]), result("circle", [flight("delay", 0.0, 3.0)])]
+    plot_study(studies, tmp_path / "study.png")
+    places = [bars.lines[0].get_xdata()[0] for bars in figures[0].axes[0].containers]
     assert places[0] < 0.0 < places[1] and places[0] == -places[1]
 
 
-def test_where_no_lap_was_flown_the_axis_is_not_negative(drawn):
-    plot_study([result("circle", [flight("delay", 0.0, None)])], "study.png")
-    success, laps = drawn[0].axes
+def test_where_no_lap_was_flown_the_axis_is_not_negative(tmp_path, figures):
+    plot_study([result("circle", [flight("delay", 0.0, None)])], tmp_path / "study.png")
+    success, laps = figures[0].axes
     assert laps.get_ylim()[0] == 0.0 and [text.get_text() for text in laps.texts] == ["no lap"]
     assert success.get_xlim()[0] < 0.0 < success.get_xlim()[1]  # places, not milliseconds
     assert [tick.get_text() for tick in laps.get_xticklabels()] == ["0"]
 
 
-def test_too_many_studies_are_refused():
+def test_too_many_studies_and_those_without_flights_are_refused():
     studies = [result(str(number), [flight("mass", 1.0, 4.0)]) for number in range(len(COLORS) + 1)]
     with pytest.raises(ValueError, match="5 studies: at most 4"):
         plot_study(studies, "study.png")
-
-
-def test_studies_without_flights_are_refused(tmp_path):
     with pytest.raises(ValueError, match="hold no flight"):
-        plot_study([result("pilot", [])], tmp_path / "study.png")
+        plot_study([result("pilot", [])], "study.png")

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import csv
 import math
-import sys
 from dataclasses import replace
 from pathlib import Path
 
@@ -22,10 +20,8 @@ from dreamer_racing.evaluation.trajectory import Trajectory
 from dreamer_racing.figures.drawing import camera_directions, draw_track
 from dreamer_racing.figures.film import top_down_frames
 from dreamer_racing.figures.report import ReturnReport
-from dreamer_racing.figures.top_down import plot_top_down
-from dreamer_racing.figures.tracks import CELL, plot_tracks
+from dreamer_racing.figures.top_down import CELL, plot_top_down, plot_tracks
 from dreamer_racing.modules import Interface
-from dreamer_racing.training.metrics import read_metrics
 from tests.dreamers import learner_of
 
 
@@ -83,21 +79,11 @@ def test_path_is_coloured_by_speed_and_ends_with_the_crash(tmp_path, figures):
     markers = {marker.get_marker(): marker.get_xydata()[0] for marker in axes.lines if marker.get_marker() != "None"}
     np.testing.assert_allclose(markers["o"], track.start_position[:2])
     np.testing.assert_allclose(markers["x"], trajectory.position[-1, :2])
+    marks = [marker for marker in axes.lines if marker.get_marker() in ("o", "x")]
+    assert all(mark.get_zorder() < line.get_zorder() for mark in marks), "a short flight would be hidden"
     assert axes.get_title(loc="left") == "circle: 1.20 s, up to 8.0 m/s (ground)"
-
-
-def test_a_short_flight_lies_over_the_marks_of_its_ends(tmp_path, figures):
-    track = load_track("circle")
-    plot_top_down(track, straight_flight(track, steps=5), tmp_path / "plot.png")
-    axes = figures[0].axes[0]
-    marks = [line for line in axes.lines if line.get_marker() in ("o", "x")]
-    assert len(marks) == 2 and all(mark.get_zorder() < axes.collections[0].get_zorder() for mark in marks)
-
-
-def test_no_crash_marker_without_a_crash(tmp_path, figures):
-    track = load_track("circle")
     plot_top_down(track, straight_flight(track, outcome="finished"), tmp_path / "plot.png")
-    assert "x" not in [line.get_marker() for line in figures[0].axes[0].lines]
+    assert "x" not in [line.get_marker() for line in figures[1].axes[0].lines]
 
 
 def test_gates_are_bars_across_the_direction_of_flight():
@@ -143,31 +129,6 @@ def test_lost_state_can_be_drawn(tmp_path):
     plot_top_down(track, trajectory, tmp_path / "plot.png")
 
 
-def write_metrics(path, rows: int = 200):
-    with path.open("w", newline="") as file:
-        writer = csv.writer(file)
-        writer.writerow(["env_steps", "episode/return", "loss", "loss_actor", "other", "empty"])
-        for row in range(rows):
-            writer.writerow([row * 1000, row if row % 2 else "", 400 - row, -0.1 if row else "nan", 1, ""])
-    return path
-
-
-def test_empty_and_non_finite_cells_are_left_out(tmp_path):
-    table = read_metrics(write_metrics(tmp_path / "metrics.csv", rows=4)).columns
-    assert list(table) == ["episode/return", "loss", "loss_actor", "other"]
-    assert [values.tolist() for values in table["episode/return"]] == [[1000, 3000], [1, 3]]
-    assert table["loss_actor"][0].tolist() == [1000, 2000, 3000]
-
-
-def test_metrics_of_nothing_are_refused(tmp_path):
-    with pytest.raises(ValueError, match="nothing was logged"):
-        read_metrics(write_metrics(tmp_path / "metrics.csv", rows=0))
-
-
-def test_pyplot_is_not_touched():
-    assert "matplotlib.pyplot" not in sys.modules or not sys.modules["matplotlib.pyplot"].get_fignums()
-
-
 # Maps of tracks side by side.
 
 
@@ -180,9 +141,6 @@ def test_every_track_is_drawn_from_above_and_from_the_side(tmp_path):
         cells = [pixels.crop((left, 0, left + 750, 840)).getextrema() for left in (0, 750, 1500)]
         assert all(low < 128 for low, _ in cells)
         assert pixels.crop((760, 850, 2240, 1670)).getextrema() == (255, 255), "cells to spare stay white"
-
-
-def test_no_track_is_refused(tmp_path):
     with pytest.raises(ValueError, match="no track"):
         plot_tracks([], tmp_path / "tracks.png")
 
