@@ -37,9 +37,8 @@ from dreamer_racing.envs.viewer import RaceWindow, ViewerUnavailableError, Windo
 from dreamer_racing.evaluation.by_hand import KINDS, FlightAbandonedError, HandPolicy, PygameSticks, check_by_hand
 from dreamer_racing.evaluation.course import Course
 from dreamer_racing.evaluation.evaluate import Episode, Evaluation, evaluate
-from dreamer_racing.figures.chase import film_from_outside
 from dreamer_racing.figures.film import GIF_SIZE
-from dreamer_racing.figures.report import report_flight
+from dreamer_racing.figures.report import film_from_outside, report_flight
 from dreamer_racing.settings import COUNT, SEED, check_choice, setting
 from dreamer_racing.terminal import say
 

@@ -1,14 +1,11 @@
 """Observed, reconstructed and imagined images of a world model, stored compactly with an evaluation for display.
 
-Shapes: W windows of T stored frames, H × W pixels, RGB, uint8; C frames of context; K control steps of an episode;
-B segments of a flight, D belief, S state of a world model.
+Shapes: W windows (1 is recorded) of T stored frames, H × W pixels, RGB, uint8; C frames of context; K control steps of
+an episode; B sequences of latents, D belief, S state of a world model.
 """
 
 from __future__ import annotations
 
-import os
-import zipfile
-import zlib
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -19,12 +16,12 @@ import torch
 from tensordict import TensorDict
 from torch import Tensor
 
+from dreamer_racing.evaluation.trajectory import BROKEN_NPZ, Trajectory, swapped_in
 from dreamer_racing.losses import State
 from dreamer_racing.modules.autoencoder import VectorDecoder
 
 if TYPE_CHECKING:
     from dreamer_racing.envs.worlds import RaceWorlds
-    from dreamer_racing.evaluation.trajectory import Trajectory
     from dreamer_racing.learners.update import WorldModelLearner
 
 Painter = Callable[[Tensor, Tensor, Tensor], Tensor]
@@ -54,19 +51,9 @@ class Dream:
 
     def save(self, path: str | Path) -> None:
         """Write a compressed `.npz` atomically."""
-        Path(path).parent.mkdir(parents=True, exist_ok=True)
-        partial = Path(path).with_name(f".{Path(path).name}.partial.npz")
         predicted = self.imagined[:, self.context :]  # the context equals the reconstruction
-        np.savez_compressed(
-            partial,
-            real=self.real,
-            reconstructed=self.reconstructed,
-            imagined=predicted,
-            context=np.array(self.context),
-            frame_dt=np.array(self.frame_dt),
-            from_pose=np.array(self.from_pose),
-        )
-        os.replace(partial, path)
+        with swapped_in(path) as partial:
+            np.savez_compressed(partial, **{**vars(self), "imagined": predicted})
 
     @classmethod
     def load(cls, path: str | Path) -> Dream:
@@ -81,19 +68,14 @@ class Dream:
                 real, reconstructed, predicted = (file[name] for name in ("real", "reconstructed", "imagined"))
                 context, frame_dt = int(file["context"]), float(file["frame_dt"])
                 from_pose = bool(file["from_pose"])
-        except (ValueError, KeyError, EOFError, zipfile.BadZipFile, zlib.error) as error:
+        except BROKEN_NPZ as error:
             raise ValueError(f"{path} holds no dream, or an incomplete one.") from error
         imagined = np.concatenate((reconstructed[:, :context], predicted), axis=1)
         return cls(real, reconstructed, imagined, context, frame_dt, from_pose)
 
 
 class BelievedView:
-    """Painter for world models that decode the race vector: renders the camera image at the decoded pose.
-
-    Args:
-        decoder: Decoder of the race vector from features.
-        worlds: Environments that render the scene.
-    """
+    """Painter for world models that decode the race vector: renders the camera image at the decoded pose."""
 
     NEIGHBOURS = (0, -1, 1)  # the model may predict a gate pass earlier or later than in the flight
     PREFERENCE = 0.01  # a neighbouring gate must fit better by this misfit, because gates may look alike [choice]
@@ -128,63 +110,45 @@ def find_painter(learner: WorldModelLearner, worlds: RaceWorlds) -> Painter | No
 
 @torch.no_grad()
 def dream(
-    learner: WorldModelLearner, trajectory: Trajectory, painter: Painter, parts: list[slice], context: int | None = None
+    learner: WorldModelLearner, trajectory: Trajectory, painter: Painter, part: slice, context: int | None = None
 ) -> Tensor:
-    """Let a world model observe the first records of segments of a flight and predict the rest from the actions.
+    """Let a world model observe the first records of a part of a flight and predict the rest from the actions.
 
     Args:
         learner: The learner with the world model.
         trajectory: A recorded episode with images.
-        painter: Function from latents to images.
-        parts: Segments of equal length T.
+        painter: See `find_painter`.
+        part: T rows of the flight.
         context: Number of records observed; None: all.
 
     Returns:
-        Images uint8 ``(B, T, H, W, 3)``, one row per segment.
+        Images uint8 ``(T, H, W, 3)``.
     """
     assert trajectory.pixels is not None
     action = torch.nn.functional.pad(trajectory.action, (0, 0, 1, 0))  # (K + 1, A) action before each row
     flight = {"pixels": trajectory.pixels, "previous_action": action, "target_gate": trajectory.target_gate}
     beside = {"imu": trajectory.imu, "vector": trajectory.vector}
     flight |= {name: numbers for name, numbers in beside.items() if numbers is not None}
-    windows = {name: torch.stack([value[part] for part in parts]) for name, value in flight.items()}
-    shape = windows["pixels"].shape[:2]
-    windows["is_init"] = torch.zeros(*shape, 1, dtype=torch.bool)
-    windows["is_init"][:, 0] = True
-    latents = learner.open_loop(TensorDict(windows, shape), context or shape[1])
-    return painter(*latents, windows["target_gate"]).cpu()
+    window = TensorDict({name: value[part][None] for name, value in flight.items()}, [1, part.stop - part.start])
+    window["is_init"] = torch.zeros(*window.shape, 1, dtype=torch.bool)
+    window["is_init"][:, 0] = True
+    latents = learner.open_loop(window, context or window.shape[1])
+    return painter(*latents, window["target_gate"])[0].cpu()
 
 
-def record_dream(
-    learner: WorldModelLearner, trajectory: Trajectory, painter: Painter | None, windows: int = 1
-) -> Dream | None:
-    """Let a world model reconstruct and imagine windows of a flight.
+def record_dream(learner: WorldModelLearner, trajectory: Trajectory, painter: Painter | None) -> Dream | None:
+    """Let a world model reconstruct and imagine the beginning of a flight.
 
-    Args:
-        learner: the learner with the world model.
-        trajectory: a recorded episode with images.
-        painter: function from latents to images, see `find_painter`.
-        windows: maximum of W; windows are evenly spaced.
-
-    Returns:
-        The dream; None without a painter or images, or if the flight is too short.
+    Returns None without a painter or images, or if the flight is too short.
     """
     pixels = trajectory.pixels
     if painter is None or pixels is None or len(pixels) <= SEEN_FRAMES * STRIDE:
         return None
     frames = min(SEEN_FRAMES + PREDICTED_FRAMES - 1, (len(pixels) - 1) // STRIDE)
-    length = STRIDE * frames + 1  # ends with a stored frame
-    starts = sorted({int(start) for start in np.linspace(0, len(pixels) - length, windows + 1)[:-1]})
-    parts = [slice(start, start + length) for start in starts]
+    part = slice(0, STRIDE * frames + 1)  # ends with a stored frame
     seen = STRIDE * (SEEN_FRAMES - 1) + 1
-    reconstructed = dream(learner, trajectory, painter, parts)
-    imagined = dream(learner, trajectory, painter, parts, seen)
-    imagined[:, :seen] = reconstructed[:, :seen]  # the same sample of the latents in both
-    return Dream(
-        real=torch.stack([pixels[part] for part in parts])[:, ::STRIDE].numpy(),
-        reconstructed=reconstructed[:, ::STRIDE].numpy(),
-        imagined=imagined[:, ::STRIDE].numpy(),
-        context=SEEN_FRAMES,
-        frame_dt=STRIDE * trajectory.control_dt,
-        from_pose=isinstance(painter, BelievedView),
-    )
+    reconstructed = dream(learner, trajectory, painter, part)
+    imagined = dream(learner, trajectory, painter, part, seen)
+    imagined[:seen] = reconstructed[:seen]  # the same sample of the latents in both
+    stored = (images[None, ::STRIDE].numpy() for images in (pixels[part], reconstructed, imagined))
+    return Dream(*stored, SEEN_FRAMES, STRIDE * trajectory.control_dt, isinstance(painter, BelievedView))

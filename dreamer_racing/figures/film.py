@@ -7,9 +7,7 @@ from __future__ import annotations
 
 import logging
 import math
-import os
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -22,35 +20,29 @@ from PIL import Image, ImageDraw
 
 from dreamer_racing.envs.tracks import Track
 from dreamer_racing.evaluation.dreams import Dream
-from dreamer_racing.evaluation.trajectory import Trajectory
+from dreamer_racing.evaluation.trajectory import Trajectory, swapped_in
 from dreamer_racing.figures.drawing import CRASH_COLOR, INK, SPEED_COLORS, camera_directions, draw_track, tilt_of
 
 VIDEO_HEIGHT = 256  # minimum height of a video in pixels, unless its scale is given
 CONTEXT_COLOR = (64, 160, 80)  # the model observes the images
 OPEN_LOOP_COLOR = (230, 120, 20)  # the model predicts the images from actions alone
 WHITE = (255, 255, 255)
+GAP = 8  # pixels between pictures side by side
+STRIP_FRAMES = 6  # per stage of training in a film strip
 MAP_MARGIN = 1.6  # m around the gates of a moving map
+MAP_TAIL = 1.0  # s of the path that a moving map shows
 GIF_SIZE = 256  # pixels, least side of either picture of a GIF
 MIN_DELAY = 0.02  # s; browsers show shorter GIF frames much longer
 
 logger = logging.getLogger(__name__)
 
 
-def write_video(
-    path: str | Path, frames: np.ndarray | torch.Tensor, fps: float = 50, scale: int | None = None, quality: int = 8
-) -> bool:
+def write_video(path: str | Path, frames: np.ndarray | torch.Tensor, fps: float = 50, scale: int | None = None) -> bool:
     """Write an H.264 (yuv420p) mp4 file, which most players support; without ffmpeg, write nothing and warn once.
 
-    Args:
-        path: the file; missing folders are created.
-        frames: (T, H, W, 3) uint8.
-        fps: frames per second.
-        scale: integer factor by which pixels are enlarged, without blurring; None for the smallest one that makes the
-            video at least 256 pixels high. Odd sizes then grow by one pixel, because H.264 needs even ones.
-        quality: from 1 to 10.
-
-    Returns:
-        Whether the file was written.
+    Frames are (T, H, W, 3) uint8. Their pixels are enlarged by an integer factor without blurring, None for the
+    smallest one that makes the video at least 256 pixels high. Odd sizes then grow by one pixel, because H.264 needs
+    even ones. Returns whether the file was written.
 
     Raises:
         ValueError: the frames have another shape or type, or there are none.
@@ -61,30 +53,13 @@ def write_video(
     import imageio.v2 as imageio  # slow to import
 
     scale = math.ceil(VIDEO_HEIGHT / array.shape[1]) if scale is None else scale
-    looks: Any = {"codec": "libx264", "pixelformat": "yuv420p", "quality": quality, "macro_block_size": 1}
+    looks: Any = {"codec": "libx264", "pixelformat": "yuv420p", "quality": 8, "macro_block_size": 1}
     with swapped_in(path) as partial:
         writer: Any = imageio.get_writer(partial, format="FFMPEG", fps=fps, **looks)
         with writer:
             for frame in array:
                 writer.append_data(_make_even(enlarge(frame, scale)))
     return True
-
-
-@contextmanager
-def swapped_in(path: str | Path) -> Iterator[Path]:
-    """Yield a temporary path with the suffix of a file, and replace the file by it when the block succeeds.
-
-    Args:
-        path: the file; missing folders are created. It is unchanged if the block fails.
-    """
-    path = Path(path)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    partial = path.with_name(f".{path.name}.partial{path.suffix}")
-    try:
-        yield partial
-        os.replace(partial, path)
-    finally:
-        partial.unlink(missing_ok=True)
 
 
 @cache
@@ -100,35 +75,18 @@ def _finds_ffmpeg() -> bool:
     return True
 
 
-def write_gif(
-    path: str | Path,
-    frames: np.ndarray | torch.Tensor,
-    fps: float = 25,
-    scale: int = 1,
-    colors: int = 64,
-    loop: bool = True,
-) -> int:
+def write_gif(path: str | Path, frames: np.ndarray | torch.Tensor, fps: float = 25, colors: int = 64) -> int:
     """Write a small GIF with one palette for all frames and no dithering, so that unchanged pixels take no space.
 
-    Args:
-        path: the file; missing folders are created.
-        frames: (T, H, W, 3) uint8.
-        fps: frames per second, 50 at most; the delay is rounded to the format's unit of 1/100 s.
-        scale: integer factor by which pixels are enlarged, without blurring.
-        colors: size of the palette, 2 to 256.
-        loop: whether the GIF repeats.
-
-    Returns:
-        Size of the file, bytes.
+    Frames are (T, H, W, 3) uint8, 50 a second at most; the delay is rounded to the format's unit of 1/100 s. The
+    palette may have 2 to 256 colours. Returns the size of the file in bytes.
 
     Raises:
         ValueError: the frames have another shape or type, or there are none.
     """
     array = _as_frames(frames, "frames")
     palette = _shared_palette(array, colors)
-    images = [
-        Image.fromarray(enlarge(frame, scale)).quantize(palette=palette, dither=Image.Dither.NONE) for frame in array
-    ]
+    images = [Image.fromarray(frame).quantize(palette=palette, dither=Image.Dither.NONE) for frame in array]
     delay = round(max(MIN_DELAY, 1 / fps), 2)
     with swapped_in(path) as partial:
         images[0].save(
@@ -139,20 +97,15 @@ def write_gif(
             duration=round(1000 * delay),
             optimize=False,
             disposal=1,
-            **({"loop": 0} if loop else {}),
+            loop=0,
         )
     return Path(path).stat().st_size
 
 
 def side_by_side(
-    real: np.ndarray | torch.Tensor,
-    imagined: np.ndarray | torch.Tensor,
-    context: int,
-    error: bool = False,
-    scale: int = 4,
-    border: int = 4,
+    real: np.ndarray | torch.Tensor, imagined: np.ndarray | torch.Tensor, context: int, scale: int = 4
 ) -> np.ndarray:
-    """Compose on-board view | prediction | (optional) absolute error.
+    """Compose on-board view | prediction.
 
     The prediction's border is green while the model observes the images and orange while it predicts open loop.
 
@@ -160,12 +113,10 @@ def side_by_side(
         real: (T, H, W, 3) uint8.
         imagined: (T, H, W, 3) uint8.
         context: number of first frames that the model observed.
-        error: whether to add the absolute difference.
         scale: integer factor by which pixels are enlarged, without blurring.
-        border: width of the borders, pixels.
 
     Returns:
-        (T, scale H + 2 border, panels (scale W + 2 border), 3) uint8.
+        (T, scale H + 8, 2 (scale W + 8), 3) uint8.
 
     Raises:
         ValueError: the frames have another shape or type, or different shapes.
@@ -173,15 +124,11 @@ def side_by_side(
     seen, predicted = _as_frames(real, "real"), _as_frames(imagined, "imagined")
     if seen.shape != predicted.shape:
         raise ValueError(f"real has shape {seen.shape}, imagined {predicted.shape}; they must be equal.")
-    panels = [seen, predicted]
-    if error:
-        panels.append(np.abs(seen.astype(np.int16) - predicted).astype(np.uint8))
     phase = np.full((len(seen), 3), OPEN_LOOP_COLOR, dtype=np.uint8)  # (T, 3)
     phase[:context] = CONTEXT_COLOR
-    colors = [np.full_like(phase, 255), phase, np.full_like(phase, 255)]
     framed = [
-        add_border(enlarge(panel, scale), color, border)
-        for panel, color in zip(panels, colors[: len(panels)], strict=True)
+        add_border(enlarge(panel, scale), color, 4)
+        for panel, color in ((seen, np.full_like(phase, WHITE)), (predicted, phase))
     ]
     return np.concatenate(framed, axis=2)
 
@@ -205,24 +152,18 @@ def add_border(panel: np.ndarray, color: np.ndarray, border: int) -> np.ndarray:
     return framed
 
 
-def top_down_frames(track: Track, trajectory: Trajectory, size: int = 256, tail: float = 1.0) -> np.ndarray:
+def top_down_frames(track: Track, trajectory: Trajectory, size: int = 256) -> np.ndarray:
     """Draw an animated map: the drone from above, its camera's direction, and the most recent part of its path.
 
-    Args:
-        track: the track.
-        trajectory: a recorded episode of K steps.
-        size: side of the square picture, pixels.
-        tail: duration of the path shown, s.
-
     Returns:
-        (K + 1, size, size, 3) uint8.
+        (K + 1, size, size, 3) uint8, for an episode of K steps.
     """
     background, points = _map_of(track, 2 * size, trajectory.position[:, :2].numpy())
     view = camera_directions(trajectory.attitude, tilt_of(trajectory))[:, :2].numpy()
     view = view * (1.0, -1.0)  # image rows go down
     speed = trajectory.speed.numpy()
     colors = (255 * SPEED_COLORS(speed / max(1.0, float(np.nanmax(speed))))[:, :3]).astype(int)
-    length = round(tail / trajectory.control_dt)
+    length = round(MAP_TAIL / trajectory.control_dt)
     frames = np.empty((len(points), size, size, 3), dtype=np.uint8)
     for now in range(len(points)):
         image = background.copy()
@@ -235,17 +176,13 @@ def top_down_frames(track: Track, trajectory: Trajectory, size: int = 256, tail:
     return frames
 
 
-def onboard_beside_map(track: Track, trajectory: Trajectory, size: int = 256, gap: int = 8) -> np.ndarray:
-    """Compose on-board view | animated map.
+def onboard_beside_map(track: Track, trajectory: Trajectory, size: int = 256) -> np.ndarray:
+    """Compose on-board view | animated map, of an episode of K steps with square images.
 
-    Args:
-        track: the track.
-        trajectory: a recorded episode of K steps with square images.
-        size: minimum side of each picture, pixels; images are enlarged to at least this by an integer factor.
-        gap: space between the pictures, pixels.
+    Images are enlarged by an integer factor to a side of at least ``size`` pixels.
 
     Returns:
-        (K + 1, side, 2 side + gap, 3) uint8.
+        (K + 1, side, 2 side + `GAP`, 3) uint8.
 
     Raises:
         ValueError: there are no images, or they are not square.
@@ -257,7 +194,7 @@ def onboard_beside_map(track: Track, trajectory: Trajectory, size: int = 256, ga
         raise ValueError(f"images of {height} × {width} pixels do not fit beside a square map.")
     view = enlarge(trajectory.pixels.numpy(), math.ceil(size / height))
     side = view.shape[1]
-    between = np.full((len(view), side, gap, 3), 255, dtype=np.uint8)
+    between = np.full((len(view), side, GAP, 3), 255, dtype=np.uint8)
     return np.concatenate((view, between, top_down_frames(track, trajectory, side)), axis=2)
 
 
@@ -312,33 +249,27 @@ def _shared_palette(frames: np.ndarray, colors: int) -> Image.Image:
     return Image.fromarray(chosen.reshape(-1, *chosen.shape[2:])).quantize(colors, method=Image.Quantize.MEDIANCUT)
 
 
-def shown_frames(dream: Dream, columns: int) -> list[int]:
-    """Choose frames to show: the last two of the context, then evenly spaced ones to the end."""
+def shown_frames(dream: Dream) -> list[int]:
+    """Choose `STRIP_FRAMES` to show: the last two of the context, then evenly spaced ones to the end."""
     last = dream.real.shape[1] - 1
     context = list(range(max(0, dream.context - 2), dream.context))
-    rest = np.linspace(dream.context, last, max(1, columns - len(context))).round().astype(int)
+    rest = np.linspace(dream.context, last, STRIP_FRAMES - len(context)).round().astype(int)
     return [*context, *sorted(set(rest.tolist()))]
 
 
-def film_strip(dream: Dream, frames: Sequence[int], scale: int = 2, border: int = 3) -> np.ndarray:
+def film_strip(dream: Dream, frames: Sequence[int]) -> np.ndarray:
     """Compose frames of the first window side by side in three rows: real, reconstructed, imagined.
 
     Borders of the lower two rows are green where the model has observed the image and orange where it predicts.
 
-    Args:
-        dream: windows of T frames.
-        frames: F indices of frames.
-        scale: integer factor by which pixels are enlarged, without blurring.
-        border: width of the borders, pixels.
-
     Returns:
-        (3 (scale H + 2 border), F (scale W + 2 border), 3) uint8.
+        (3 (2 H + 6), F (2 W + 6), 3) uint8: pixels are enlarged twice, and borders have 3 pixels.
     """
     chosen = np.array(frames)
     seen = np.where((chosen < dream.context)[:, None], CONTEXT_COLOR, OPEN_LOOP_COLOR)  # (F, 3)
     colors = (np.broadcast_to(WHITE, seen.shape), np.broadcast_to(CONTEXT_COLOR, seen.shape), seen)
     rows = [
-        np.concatenate(list(add_border(enlarge(images[0, chosen], scale), color, border)), axis=1)
+        np.concatenate(list(add_border(enlarge(images[0, chosen], 2), color, 3)), axis=1)
         for images, color in zip((dream.real, dream.reconstructed, dream.imagined), colors, strict=True)
     ]
     return np.concatenate(rows)

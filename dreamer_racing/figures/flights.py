@@ -11,9 +11,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
-import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.cm import ScalarMappable
 from matplotlib.colors import Normalize
 from matplotlib.figure import Figure
 from matplotlib.layout_engine import ConstrainedLayoutEngine
@@ -24,14 +22,14 @@ from dreamer_racing.evaluation.dreams import Dream
 from dreamer_racing.evaluation.trajectory import Trajectory
 from dreamer_racing.figures.drawing import (
     INK,
-    SPEED_COLORS,
     draw_flight,
+    draw_speed_scale,
     draw_track,
     flight_legend,
     save,
     speed_scale,
 )
-from dreamer_racing.figures.film import CONTEXT_COLOR, OPEN_LOOP_COLOR, film_strip, shown_frames
+from dreamer_racing.figures.film import CONTEXT_COLOR, OPEN_LOOP_COLOR, STRIP_FRAMES, film_strip, shown_frames
 from dreamer_racing.figures.profiles import PROFILE_AXES, altitude_legend, draw_altitude, draw_speed
 from dreamer_racing.settings import check_choice
 
@@ -58,12 +56,7 @@ def plot_flights(
 
     Reference: paper, Figs. "emergent" (with decoys and without) and "real world" (simulated and real).
 
-    Args:
-        flights: the flights.
-        path: the file to write; missing folders are created.
-        over: axis of the profiles: ``distance`` flown (m) or ``time`` (s).
-        columns: maximum number of flights in a row.
-        problems: lines for everything left out.
+    Profiles are over an axis of `PROFILE_AXES`. ``problems`` are lines for everything left out.
 
     Raises:
         ValueError: there are no flights, or the axis is unknown.
@@ -89,9 +82,7 @@ def plot_flights(
         for axes in own if column else ():
             axes.set_ylabel("")
         panels += own
-    bar = figure.colorbar(ScalarMappable(speed, SPEED_COLORS), ax=panels, shrink=0.6, aspect=35, pad=0.01)
-    bar.set_label("speed (m/s)")
-    bar.outline.set_visible(False)
+    draw_speed_scale(figure, panels, speed)
     decoys, crash = any(f.track.decoys for f in flights), any(f.trajectory.crashed for f in flights)
     handles = flight_legend(decoys, crash) + altitude_legend([flight[1:] for flight in flights])
     figure.legend(handles=handles, loc="outside lower left", ncols=3 if columns == 1 else 8, frameon=False, fontsize=9)
@@ -108,7 +99,8 @@ def _draw_flight_and_profiles(
     middle = [(low + high) / 2 for low, high in zip(flight.track.bounds_low, flight.track.bounds_high, strict=True)]
     axes.set_xlim(middle[0] - 1.03 * half[0], middle[0] + 1.03 * half[0])
     axes.set_ylim(middle[1] - 1.03 * half[1], middle[1] + 1.03 * half[1])
-    axes.set_title(f"{flight.title}\n{_outcome(flight)}", loc="left", fontsize=9, color=INK)
+    flown = f"{flight.trajectory.gates_passed} gates in {flight.trajectory.duration:.2f} s ({flight.trajectory.ending})"
+    axes.set_title(f"{flight.title}\n{flight.track.name}: {flown}", loc="left", fontsize=9, color=INK)
     draw_altitude(altitude, flight.track, flight.trajectory, speed, over, numbers=False)
     draw_speed(profile, flight.trajectory, speed, over)
     altitude.set_xlabel("")
@@ -120,35 +112,22 @@ def _floor_size(track: Track) -> tuple[float, float]:
     return x_high - x_low, y_high - y_low
 
 
-def _outcome(flight: NamedFlight) -> str:
-    seconds = len(flight.trajectory.action) * flight.trajectory.control_dt
-    gates = int((np.diff(flight.trajectory.target_gate) != 0).sum())
-    outcome = (flight.trajectory.outcome or "recording stopped").replace("_", " ")
-    return f"{flight.track.name}: {gates} gates in {seconds:.2f} s ({outcome})"
+def plot_dreams(dreams: Sequence[tuple[str, Dream]], path: str | Path, problems: Sequence[str] = ()) -> None:
+    """Draw real, reconstructed and imagined observations of named stages of training, time from left to right.
 
-
-def plot_dreams(
-    dreams: Sequence[tuple[str, Dream]], path: str | Path, columns: int = 6, problems: Sequence[str] = ()
-) -> None:
-    """Draw real, reconstructed and imagined observations of several stages of training, time from left to right.
+    Only the first window of each is shown.
 
     Reference: paper, Fig. "imagined".
-
-    Args:
-        dreams: the stages, each with its name; only the first window is shown.
-        path: the file to write; missing folders are created.
-        columns: number of frames per stage.
-        problems: lines for everything left out.
 
     Raises:
         ValueError: there are no dreams.
     """
     if not dreams:
         raise ValueError("no dreams to draw.")
-    figure = Figure(figsize=(1.4 + 1.15 * columns, 4.0 * len(dreams) + 0.3), layout="compressed")
+    figure = Figure(figsize=(1.4 + 1.15 * STRIP_FRAMES, 4.0 * len(dreams) + 0.3), layout="compressed")
     panels = figure.subplots(len(dreams), 1, squeeze=False)[:, 0]
     for axes, (name, dream) in zip(panels, dreams, strict=True):
-        frames = shown_frames(dream, columns)
+        frames = shown_frames(dream)
         strip = film_strip(dream, frames)
         axes.imshow(strip, interpolation="nearest")
         height, width = strip.shape[0] / 3, strip.shape[1] / len(frames)

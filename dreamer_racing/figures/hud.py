@@ -29,9 +29,7 @@ SEEN = "seen"
 def race_words(track: Track, trajectory: Trajectory) -> list[str]:
     """Return captions with time, speed, next gate and lap for each of the K + 1 rows of a flight.
 
-    Args:
-        track: the track.
-        trajectory: a flight from the start of the episode; in a `Trajectory.part`, time and laps would start anew.
+    The flight is from the start of the episode; in a `Trajectory.part`, time and laps would start anew.
     """
     completed = laps_completed(trajectory).tolist()
     rows = zip(trajectory.speed.tolist(), trajectory.target_gate.tolist(), completed, strict=True)
@@ -40,6 +38,10 @@ def race_words(track: Track, trajectory: Trajectory) -> list[str]:
         f"lap {min(laps + 1, track.laps)}/{track.laps}"
         for row, (speed, target, laps) in enumerate(rows)
     ]
+
+
+def _speed(speed: float) -> str:
+    return f"{speed:4.1f} m/s" if math.isfinite(speed) else " lost"
 
 
 def laps_completed(trajectory: Trajectory) -> np.ndarray:
@@ -57,18 +59,10 @@ def second_lap(trajectory: Trajectory) -> tuple[int, int]:
     return (ends[0], ends[1]) if len(ends) > 1 else (0, min(BEGINNING, len(trajectory.action)))
 
 
-def _speed(speed: float) -> str:
-    return f"{speed:4.1f} m/s" if math.isfinite(speed) else " lost"
-
-
 def dream_words(frames: int, context: int, frame_dt: float, cycle: int | None = None) -> list[str]:
     """Return captions that say for each frame whether the model observes it, or how long it has imagined.
 
-    Args:
-        frames: T.
-        context: number of frames that the model observes first.
-        frame_dt: time between frames, s.
-        cycle: period in frames after which the context starts again; None for no repetition.
+    The context, the frames that the model observes first, starts again after a ``cycle`` of frames, if there is one.
     """
     place = [frame % cycle if cycle else frame for frame in range(frames)]
     return [SEEN if at < context else f"imagined {(at - context + 1) * frame_dt:+.2f} s" for at in place]
@@ -82,13 +76,10 @@ def slow_motion(seconds: float) -> int:
 def caption(frames: np.ndarray, left: Sequence[str], right: Sequence[str] = ()) -> np.ndarray:
     """Add a strip with a caption above every frame.
 
-    Args:
-        frames: (T, H, W, 3) uint8, large enough for legible text.
-        left: one caption per frame.
-        right: captions above the right half, if any; green if `SEEN`, else orange.
+    Captions above the right half, if any, are green if `SEEN`, else orange.
 
     Returns:
-        (T, H + strip, W, 3) uint8.
+        (T, H + strip, W, 3) uint8, of frames (T, H, W, 3).
 
     Raises:
         ValueError: the numbers of captions and frames differ.
@@ -111,17 +102,13 @@ def caption(frames: np.ndarray, left: Sequence[str], right: Sequence[str] = ()) 
     return np.concatenate((strips, frames), axis=1)
 
 
-def dream_video(dreams: Sequence[tuple[str, Dream]], scale: int = 2) -> np.ndarray:
-    """Compose stages of training below each other, each as real | imagined; shorter ones hold their last frame.
-
-    Args:
-        dreams: the stages, each with its name; the windows of a stage are shown one after another.
-        scale: integer factor by which pixels are enlarged, without blurring.
+def dream_video(dreams: Sequence[tuple[str, Dream]]) -> np.ndarray:
+    """Compose named stages of training below each other, each as real | imagined; shorter ones hold their last frame.
 
     Returns:
-        (frames, height, width, 3) uint8.
+        (frames, height, width, 3) uint8; the windows of a stage are shown one after another.
     """
-    films = [_film(name, dream, scale) for name, dream in dreams]
+    films = [_film(name, dream) for name, dream in dreams]
     length = max(map(len, films))
     held = [np.concatenate((film, film[-1:].repeat(length - len(film), axis=0))) for film in films]
     return np.concatenate(held, axis=1)
@@ -136,8 +123,8 @@ def _fitting_font(line: str, room: int) -> ImageFont.FreeTypeFont:
     return font
 
 
-def _film(name: str, dream: Dream, scale: int) -> np.ndarray:
+def _film(name: str, dream: Dream) -> np.ndarray:
     pairs = zip(dream.real, dream.imagined, strict=True)
-    frames = np.concatenate([side_by_side(*pair, context=dream.context, scale=scale) for pair in pairs])
+    frames = np.concatenate([side_by_side(*pair, context=dream.context, scale=2) for pair in pairs])
     words = dream_words(len(frames), dream.context, dream.frame_dt, cycle=dream.real.shape[1])
     return caption(frames, [name] * len(frames), words)

@@ -1,19 +1,22 @@
-"""Reports of evaluations: numbers, a plot of the flight, and a video with the world model's predictions.
+"""Reports of evaluations: numbers, a plot of the flight, and films, of a world model's predictions and from outside.
 
 Shapes: K control steps of a recorded episode.
 """
 
 import json
+import math
 from collections.abc import Callable
 from contextlib import AbstractContextManager, nullcontext
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor
 from torchrl.envs import EnvBase
 
 from dreamer_racing.envs.policy_memory import with_memory
+from dreamer_racing.envs.simulator.chase import ChaseView
 from dreamer_racing.envs.tracks import Track
 from dreamer_racing.evaluation.course import Course, act
 from dreamer_racing.evaluation.dreams import Painter, dream, find_painter, record_dream
@@ -21,7 +24,9 @@ from dreamer_racing.evaluation.evaluate import Evaluation, Trajectory, split_epi
 from dreamer_racing.evaluation.protocol import Result
 from dreamer_racing.evaluation.trajectory import write_flight
 from dreamer_racing.figures.film import (
+    GAP,
     GIF_SIZE,
+    enlarge,
     enlarge_to_watch,
     onboard_beside_map,
     side_by_side,
@@ -35,6 +40,7 @@ from dreamer_racing.learners.update import WorldModelLearner
 from dreamer_racing.training.directory import EVALUATION, RunDirectory
 
 GIF_STRIDE = 2  # control steps a frame: 25 frames a second
+CHASE_STRIDE, CHASE_COLORS = 3, 32  # control steps a frame, and colours, of chase.gif, in which all of it moves
 SEEN_STEPS, DREAMT_STEPS = 10, 40  # control steps observed by the model, then predicted open loop, in the video
 
 
@@ -46,7 +52,7 @@ class EvaluationReport:
         learner: the learner with the policy and, if any, the world model.
         worlds: arguments of `DroneRacingEnv`: track, preset, renderer, camera.
         episodes: number of episodes per evaluation.
-        video_steps: maximum control steps K in the video.
+        video_steps: maximum control steps in the video.
         num_envs: see `Course`.
         seed: seed of the environment, set before each evaluation, so that all have the same starts and drones.
     """
@@ -75,17 +81,14 @@ class EvaluationReport:
         Returns:
             Metrics `evaluation/...`, and `evaluation_stochastic/...` if ``stochastic``.
         """
-        metrics = self._report_policy(f"{env_steps:09d}", "evaluation", deterministic=True)
-        if stochastic:
-            metrics |= self._report_policy(f"{env_steps:09d}_stochastic", "evaluation_stochastic", deterministic=False)
+        metrics: dict[str, float] = {}
+        for suffix in ("", "_stochastic") if stochastic else ("",):
+            result = self.evaluate(deterministic=not suffix)
+            with self.attempt("evaluations, plots and videos"):
+                self.write(f"{env_steps:09d}{suffix}", result)
+            numbers = {name: value for name, value in result.to_dict().items() if isinstance(value, (int, float))}
+            metrics |= {f"evaluation{suffix}/{name}": float(value) for name, value in numbers.items()}
         return metrics
-
-    def _report_policy(self, name: str, prefix: str, deterministic: bool) -> dict[str, float]:
-        result = self.evaluate(deterministic)
-        with self.attempt("evaluations, plots and videos"):
-            self.write(name, result)
-        numbers = {key: value for key, value in result.to_dict().items() if isinstance(value, (int, float))}
-        return {f"{prefix}/{key}": float(value) for key, value in numbers.items()}
 
     def evaluate(self, deterministic: bool) -> Evaluation:
         """Run the episodes."""
@@ -142,7 +145,7 @@ class ReturnReport:
         env: environment of batch size [N], with `pixels` or `vector`.
         episodes: number of episodes per evaluation, assigned to the N environments beforehand.
         video_steps: maximum number of steps in the video.
-        seed: seed of the environment, set before each evaluation: all have the same starts, even after resuming.
+        seed: set before each evaluation: all have the same starts, even after resuming.
     """
 
     def __init__(
@@ -225,14 +228,8 @@ class ReturnReport:
 def dream_beside_flight(learner: WorldModelLearner, trajectory: Trajectory, painter: Painter, max_steps: int) -> Tensor:
     """Compose the on-board view and the world model's prediction, alternating between context and open loop.
 
-    Args:
-        learner: the learner with the world model.
-        trajectory: a recorded episode with images.
-        painter: function from latents to images.
-        max_steps: maximum of K.
-
     Returns:
-        uint8 frames (K, height, width, 3).
+        uint8 frames (T, height, width, 3), at most ``max_steps`` of them.
     """
     assert trajectory.pixels is not None
     pixels = trajectory.pixels[:max_steps]
@@ -240,7 +237,7 @@ def dream_beside_flight(learner: WorldModelLearner, trajectory: Trajectory, pain
     for start in range(0, len(pixels), SEEN_STEPS + DREAMT_STEPS):
         part = slice(start, min(start + SEEN_STEPS + DREAMT_STEPS, len(pixels)))
         seen = min(SEEN_STEPS, part.stop - start)
-        dreamt = dream(learner, trajectory, painter, [part], seen)[0]
+        dreamt = dream(learner, trajectory, painter, part, seen)
         shown.append(torch.as_tensor(side_by_side(pixels[part], dreamt, seen)))
     return torch.cat(shown)
 
@@ -274,3 +271,41 @@ def report_flight(directory: Path, track: Track, result: Evaluation) -> str:
     gif = caption(frames, words[first : last + 1 : GIF_STRIDE])
     size = write_gif(directory / "onboard.gif", gif, fps=1 / (GIF_STRIDE * trajectory.control_dt))
     return f"{files}, {'onboard.mp4, ' if filmed else ''}onboard.gif ({size / 1e6:.2f} MB)"
+
+
+def film_from_outside(directory: Path, view: ChaseView, track: Track, trajectory: Trajectory) -> str:
+    """Write a video of the whole flight and a GIF of its second lap, from outside and by the drone; name the files."""
+    frames, words = chase_beside_onboard(view, trajectory), race_words(track, trajectory)
+    view.close()
+    filmed = write_video(directory / "chase.mp4", caption(frames, words), fps=1 / trajectory.control_dt, scale=1)
+    first, last = second_lap(trajectory)
+    shown = slice(first, last + 1, CHASE_STRIDE)
+    gif, fps = caption(frames[shown], words[shown]), 1 / (CHASE_STRIDE * trajectory.control_dt)
+    size = write_gif(directory / "chase.gif", gif, fps, CHASE_COLORS)
+    return f"{'chase.mp4, ' if filmed else ''}chase.gif ({size / 1e6:.2f} MB)"
+
+
+def chase_beside_onboard(view: ChaseView, trajectory: Trajectory) -> np.ndarray:
+    """Compose chase view | on-board view, or the chase view alone if there are no images.
+
+    Returns:
+        (K + 1, size, size + `GAP` + width, 3) uint8. On-board images are scaled by an integer factor and centred.
+    """
+    outside = _chase_frames(view, trajectory)
+    if trajectory.pixels is None:
+        return outside
+    height = outside.shape[1]
+    seen = enlarge(trajectory.pixels.numpy(), max(1, height // trajectory.pixels.shape[1]))
+    if seen.shape[1] > height:
+        seen = seen[:, :: math.ceil(seen.shape[1] / height), :: math.ceil(seen.shape[1] / height)]
+    missing = height - seen.shape[1]
+    seen = np.pad(seen, ((0, 0), (missing // 2, missing - missing // 2), (GAP, 0), (0, 0)), constant_values=255)
+    return np.concatenate((outside, seen), axis=2)
+
+
+def _chase_frames(view: ChaseView, trajectory: Trajectory) -> np.ndarray:
+    """Render a flight from the chase camera, (K + 1, size, size, 3) uint8."""
+    position, attitude = trajectory.position.double().numpy(), trajectory.attitude.double().numpy()
+    gate, time = trajectory.target_gate.numpy(), trajectory.control_dt * np.arange(len(position))
+    rows = (slice(row, row + 1) for row in range(len(position)))
+    return np.concatenate([view.draw(position[row], attitude[row], gate[row], time[row]) for row in rows])

@@ -21,7 +21,6 @@ from dreamer_racing.envs.simulator.opengl import RendererUnavailableError
 from dreamer_racing.envs.tracks import load_track
 from dreamer_racing.evaluation.trajectory import Trajectory
 from dreamer_racing.figures import film
-from dreamer_racing.figures.chase import chase_beside_onboard, chase_frames
 from dreamer_racing.figures.film import (
     CONTEXT_COLOR,
     OPEN_LOOP_COLOR,
@@ -32,6 +31,7 @@ from dreamer_racing.figures.film import (
     write_video,
 )
 from dreamer_racing.figures.hud import SEEN, STRIP_COLOR, caption, dream_words, laps_completed, race_words, slow_motion
+from dreamer_racing.figures.report import chase_beside_onboard
 from tests.figures.test_flights import random_flight
 
 PALETTE = np.array([[200, 30, 30], [30, 200, 30], [30, 30, 200], [240, 240, 240]], dtype=np.uint8)
@@ -59,8 +59,6 @@ def flight(steps: int = 10) -> Trajectory:
 @pytest.mark.parametrize(
     ("size", "scale", "expected"),
     [
-        ((16, 16), 4, (64, 64)),
-        ((16, 16), None, (256, 256)),
         ((64, 40), None, (256, 160)),
         ((272, 20), None, (272, 20)),  # already large: not enlarged
         ((15, 21), 3, (46, 64)),  # H.264 wants even sizes
@@ -120,42 +118,36 @@ def test_without_ffmpeg_one_warning_stands_for_all_videos(tmp_path, monkeypatch,
 
 def test_gif_reads_back(tmp_path):
     frames = torch.as_tensor(blocks(12))
-    size = write_gif(tmp_path / "new" / "a.gif", frames, fps=25, scale=2, colors=16)
+    size = write_gif(tmp_path / "new" / "a.gif", frames, fps=25, colors=16)
     assert size == (tmp_path / "new" / "a.gif").stat().st_size < 4000
     with Image.open(tmp_path / "new" / "a.gif") as image:
-        assert (image.n_frames, image.size, image.info["duration"], image.info["loop"]) == (12, (32, 32), 40, 0)
+        assert (image.n_frames, image.size, image.info["duration"], image.info["loop"]) == (12, (16, 16), 40, 0)
         for index in range(12):
             image.seek(index)
             shown = np.asarray(image.convert("RGB")).astype(int)
-            assert np.abs(shown[::2, ::2] - frames[index].numpy()).max() <= 8
-
-
-def test_gif_delay_is_one_that_browsers_keep(tmp_path):
-    write_gif(tmp_path / "a.gif", blocks(3), fps=100, loop=False)
+            assert np.abs(shown - frames[index].numpy()).max() <= 8
+    write_gif(tmp_path / "a.gif", blocks(3), fps=100)
     with Image.open(tmp_path / "a.gif") as image:
-        assert image.info["duration"] == 20
-        assert "loop" not in image.info
+        assert image.info["duration"] == 20  # ms, which browsers keep
 
 
 def test_side_by_side_places_panels_and_marks_the_phase():
     real, imagined = blocks(6), 255 - blocks(6)
-    frames = side_by_side(torch.as_tensor(real), imagined, context=2, error=True, scale=3, border=4)
+    frames = side_by_side(torch.as_tensor(real), imagined, context=2, scale=3)
     side = 3 * 16 + 8
-    assert frames.shape == (6, side, 3 * side, 3)
-    assert frames.dtype == np.uint8
-    inner = slice(4, 4 + 48)
-    panels = [frames[:, inner, first + 4 : first + 52] for first in (0, side, 2 * side)]
-    np.testing.assert_array_equal(panels[0][:, 1::3, 1::3], real)
-    np.testing.assert_array_equal(panels[1][:, ::3, ::3], imagined)
-    np.testing.assert_array_equal(panels[2][:, 2::3, ::3], np.abs(real.astype(int) - imagined))
-    border = frames[:, 0, side + 5]
-    np.testing.assert_array_equal(border, [CONTEXT_COLOR] * 2 + [OPEN_LOOP_COLOR] * 4)
-    assert side_by_side(real, imagined, context=2).shape == (6, 72, 144, 3)
+    assert frames.shape == (6, side, 2 * side, 3) and frames.dtype == np.uint8
+    left, right = (frames[:, 4:52, first + 4 : first + 52] for first in (0, side))
+    np.testing.assert_array_equal(left[:, 1::3, 1::3], real)
+    np.testing.assert_array_equal(right[:, ::3, ::3], imagined)
+    np.testing.assert_array_equal(frames[:, 0, side + 5], [CONTEXT_COLOR] * 2 + [OPEN_LOOP_COLOR] * 4)
+    with pytest.raises(ValueError, match="must be equal"):
+        side_by_side(real, imagined[:2], context=1)
 
 
-def test_moving_map_follows_the_drone():
+def test_moving_map_follows_the_drone(monkeypatch):
     track = load_track("circle")
-    frames = top_down_frames(track, flight(), size=128, tail=0.04)
+    monkeypatch.setattr(film, "MAP_TAIL", 0.04)
+    frames = top_down_frames(track, flight(), size=128)
     assert frames.shape == (11, 128, 128, 3)
     dark = [np.argwhere((frame < 80).all(-1)).mean(0) for frame in frames[:-1]]  # the dot is the only dark thing
     columns = np.array([column for _, column in dark])
@@ -172,13 +164,11 @@ def test_lost_state_can_be_drawn():
 
 def test_onboard_beside_map():
     track = load_track("circle")
-    frames = onboard_beside_map(track, flight(), size=64, gap=6)
-    assert frames.shape == (11, 64, 64 + 6 + 64, 3)
+    frames = onboard_beside_map(track, flight(), size=60)  # grows to the next multiple of the images'
+    assert frames.shape == (11, 64, 64 + 8 + 64, 3)
     np.testing.assert_array_equal(frames[:, ::4, :64:4], blocks(11))
-    assert (frames[:, :, 64:70] == 255).all()
-    # A size that is no multiple of the images' grows to the next.
-    np.testing.assert_array_equal(onboard_beside_map(track, flight(), size=60, gap=6), frames)
-    assert onboard_beside_map(track, flight(), size=8, gap=6).shape == (11, 16, 16 + 6 + 16, 3)
+    assert (frames[:, :, 64:72] == 255).all()
+    assert onboard_beside_map(track, flight(), size=8).shape == (11, 16, 16 + 8 + 16, 3)
     with pytest.raises(ValueError, match="16 × 12 pixels"):
         onboard_beside_map(track, replace(flight(), pixels=flight().pixels[:, :, :12]))
     with pytest.raises(ValueError, match="from_pixels=True"):
@@ -190,11 +180,6 @@ def test_onboard_beside_map():
 def test_wrong_frames_are_refused(tmp_path, write, frames):
     with pytest.raises(ValueError, match="must be uint8"):
         write(tmp_path / "file", frames)
-
-
-def test_panels_of_different_sizes_are_refused():
-    with pytest.raises(ValueError, match="must be equal"):
-        side_by_side(blocks(3), blocks(2), context=1)
 
 
 # Words on films: what they say of a race by hand, and that they cover nothing of it.
@@ -347,13 +332,12 @@ def test_beside_it_stands_what_the_drone_sees() -> None:
     trajectory = flight_of(2)
     view = view_of_circle(size=60)
     frames = chase_beside_onboard(view, trajectory)
-    outside = chase_frames(view, trajectory)
-    assert frames.shape == (2, 60, 60 + 8 + 48, 3)
+    outside = chase_beside_onboard(view, replace(trajectory, pixels=None))
+    assert outside.shape == (2, 60, 60, 3) and frames.shape == (2, 60, 60 + 8 + 48, 3)
     assert np.array_equal(frames[:, :, :60], outside)
     assert (frames[:, 6:54, 68:] == 100).all() and (frames[:, :6, 60:] == 255).all()
     large = chase_beside_onboard(view, flight_of(1, image_size=100))
     assert large.shape == (1, 60, 60 + 8 + 50, 3)
-    assert np.array_equal(chase_beside_onboard(view, replace(trajectory, pixels=None)), outside)
     view.close()
 
 
@@ -361,7 +345,7 @@ def test_a_flight_is_filmed_up_to_its_first_non_finite_state() -> None:
     trajectory = flight_of(3)
     trajectory.position[1:] = torch.nan
     view = view_of_circle(size=32)
-    frames = chase_frames(view, trajectory)
+    frames = chase_beside_onboard(view, replace(trajectory, pixels=None))
     view.close()
     assert frames[0].any() and not frames[1:].any()
 

@@ -37,9 +37,7 @@ def random_flight(steps: int = 60, outcome: str | None = "ground", pixels: bool 
         linear_velocity=rows["v"] * 1e-7,
         target_gate=torch.arange(steps + 1) // 25,
         action=torch.rand(steps, 4, generator=generator),
-        pixels=torch.randint(0, 256, (steps + 1, 64, 64, 3), dtype=torch.uint8, generator=generator)
-        if pixels
-        else None,
+        pixels=torch.randint(0, 256, (steps + 1, 64, 64, 3), dtype=torch.uint8) if pixels else None,
         control_dt=0.02,
         outcome=outcome,
     )
@@ -96,7 +94,7 @@ def test_images_are_never_those_of_another_flight(tmp_path):
             read_flight(tmp_path / "two_trajectory.csv")
 
 
-@pytest.mark.parametrize("cut", [1, 30, 700, 5000])
+@pytest.mark.parametrize("cut", [1, 700])
 def test_an_incomplete_flight_is_refused(tmp_path, cut):
     path = tmp_path / "flight.csv"
     write_trajectory(path, random_flight(), "circle")
@@ -133,17 +131,13 @@ def as_they_are(belief, state, target_gate):
 
 def test_a_dream_is_a_flight_reconstructed_and_predicted(tmp_path):
     flight = random_flight(steps=100, pixels=True)
-    dream = record_dream(DREAMER, flight, as_they_are, windows=2)
-    assert dream is not None and dream.real.shape == (2, SEEN_FRAMES + PREDICTED_FRAMES, 64, 64, 3)
+    dream = record_dream(DREAMER, flight, as_they_are)
+    assert dream is not None and dream.real.shape == (1, SEEN_FRAMES + PREDICTED_FRAMES, 64, 64, 3)
     assert dream.frame_dt == pytest.approx(0.02 * STRIDE)
-    starts = (0, (101 - (STRIDE * (SEEN_FRAMES + PREDICTED_FRAMES - 1) + 1)) // 2)
-    for real, start in zip(dream.real, starts, strict=True):
-        np.testing.assert_array_equal(real, flight.pixels[start::STRIDE][: SEEN_FRAMES + PREDICTED_FRAMES])
+    np.testing.assert_array_equal(dream.real[0], flight.pixels[::STRIDE][: SEEN_FRAMES + PREDICTED_FRAMES])
     np.testing.assert_array_equal(dream.reconstructed, dream.real // 2 + 1)
     np.testing.assert_array_equal(dream.imagined[:, :SEEN_FRAMES], dream.reconstructed[:, :SEEN_FRAMES])
-    assert (
-        dream.imagined[:, SEEN_FRAMES:] == STRIDE * (SEEN_FRAMES - 1) + 1
-    ).all()  # the last seen record is a stored one
+    assert (dream.imagined[:, SEEN_FRAMES:] == STRIDE * (SEEN_FRAMES - 1) + 1).all()  # the last one seen is stored
     dream.save(tmp_path / "a_dream.npz")
     again = Dream.load(tmp_path / "a_dream.npz")
     for name in ("real", "reconstructed", "imagined"):
@@ -177,7 +171,7 @@ def flat_dream(context: int = 3, frames: int = 13) -> Dream:
 
 
 def test_film_strip_places_and_colours():
-    strip = film_strip(flat_dream(), [2, 3], scale=2, border=3)
+    strip = film_strip(flat_dream(), [2, 3])
     assert strip.shape == (3 * 22, 2 * 22, 3)
     for row, value in enumerate((10, 20, 30)):
         for column in range(2):
@@ -188,8 +182,8 @@ def test_film_strip_places_and_colours():
 
 
 def test_shown_frames_are_the_end_of_the_context_and_even_after_it():
-    assert shown_frames(flat_dream(), 6) == [1, 2, 3, 6, 9, 12]
-    assert shown_frames(flat_dream(frames=4), 6) == [1, 2, 3]
+    assert shown_frames(flat_dream()) == [1, 2, 3, 6, 9, 12]
+    assert shown_frames(flat_dream(frames=4)) == [1, 2, 3]
 
 
 def test_dreams_of_three_stages(tmp_path, figures):
@@ -198,7 +192,7 @@ def test_dreams_of_three_stages(tmp_path, figures):
     assert [axes.get_title(loc="left") for axes in panels] == ["early", "middle", "late"]
     labels = [text.get_text() for text in panels[0].get_xticklabels()]
     assert labels[:3] == ["-0.08 s", "+0.00 s", "+0.08 s"] and labels[-1] == "+0.80 s"
-    video = dream_video([("early", flat_dream(frames=5)), ("late", flat_dream())], scale=2)
+    video = dream_video([("early", flat_dream(frames=5)), ("late", flat_dream())])
     assert video.shape == (13, 2 * (15 + 2 * 8 + 8), 2 * (2 * 8 + 8), 3)  # a strip of words above each
 
 
@@ -229,10 +223,9 @@ def test_maps_of_different_halls_have_one_scale_and_stand_in_line(tmp_path, figu
         for side in ("y0", "y1", "width"):
             assert np.ptp([getattr(box, side) for box in boxes]) < 0.002, (row, side)
     for flight, axes in zip(flights, figures[0].axes[0:9:3], strict=True):
-        for low, high, limits in zip(
-            flight.track.bounds_low, flight.track.bounds_high, (axes.get_xlim(), axes.get_ylim()), strict=False
-        ):
-            assert limits[0] < low < high < limits[1]
+        (left, right), (bottom, top), track = axes.get_xlim(), axes.get_ylim(), flight.track
+        assert left < track.bounds_low[0] < track.bounds_high[0] < right
+        assert bottom < track.bounds_low[1] < track.bounds_high[1] < top
 
 
 def straight(height: float, backwards: bool = False) -> Trajectory:
@@ -255,10 +248,8 @@ def test_altitude_tells_a_gate_passed_from_one_flown_over(figures):
         axes = Figure().subplots()
         draw_altitude(axes, track, straight(height), speed_scale([straight(height)]))
         beams = [line.get_xydata() for line in axes.lines if line.get_color() == color]
-        shape = track.shape
-        expected = [
-            [[2.25, 1.35 + sign * shape.opening / 2], [2.25, 1.35 + sign * shape.outer / 2]] for sign in (-1, 1)
-        ]
+        ends = (track.shape.opening / 2, track.shape.outer / 2)
+        expected = [[[2.25, 1.35 + sign * end] for end in ends] for sign in (-1, 1)]
         np.testing.assert_allclose(beams, expected)
         assert axes.get_ylim()[0] == 0.0 and axes.get_ylim()[1] > height
 
