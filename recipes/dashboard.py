@@ -26,8 +26,7 @@ from dreamer_racing.evaluation.protocol import fly as fly_races
 from dreamer_racing.evaluation.trajectory import NUMBERS, read_flight
 from dreamer_racing.export.agents import existing_agent_path
 from dreamer_racing.export.shipped_agent import is_agent
-from dreamer_racing.figures.dashboard import write_page
-from dreamer_racing.figures.dashboard_live import serve
+from dreamer_racing.figures.dashboard import serve, write_page
 from dreamer_racing.figures.dashboard_panel import ShownFlight, how_it_trained, missing
 from dreamer_racing.figures.evaluations import STORED, stored_flights
 from dreamer_racing.figures.plotting import run_of, stage_name

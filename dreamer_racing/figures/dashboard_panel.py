@@ -134,7 +134,7 @@ def state_words(track: Track, flight: Trajectory) -> list[list[str]]:
     words = [
         [f"{lap}/{track.laps}", f"{gate}/{track.num_gates}", "flying"] for lap, gate in zip(laps, gates, strict=True)
     ]
-    words[-1][2] = (flight.outcome or "recording stopped").replace("_", " ")
+    words[-1][2] = flight.ending
     return words
 
 
@@ -166,11 +166,10 @@ def _legend(shown: Sequence[tuple[ShownFlight, Paint]]) -> str:
 
 def _result(flight: Trajectory) -> str:
     """Return the outcome of a flight and its lap times as text."""
-    ended = (flight.outcome or "recording stopped").replace("_", " ")
     completed = laps_completed(flight)
     ends = [0, *(np.flatnonzero(np.diff(completed)) + 1).tolist()]
     laps = " ".join(f"{(after - before) * flight.control_dt:.2f}" for before, after in pairwise(ends))
-    return f"{ended}, {'laps ' + laps + ' s' if laps else 'no lap'}"
+    return f"{flight.ending}, {'laps ' + laps + ' s' if laps else 'no lap'}"
 
 
 def _views(shown: Sequence[tuple[ShownFlight, Paint]]) -> str:
@@ -273,7 +272,7 @@ def _number(value: float) -> float | None:
 
 def duration(flights: Sequence[Trajectory]) -> float:
     """Return the duration of the longest flight, s."""
-    return max((len(flight.position) - 1) * flight.control_dt for flight in flights)
+    return max(flight.duration for flight in flights)
 
 
 def row_at(flight: Trajectory, time: float) -> int:

@@ -30,8 +30,7 @@ from dreamer_racing.figures.hil_numbers import (
 from dreamer_racing.hil.progress import GatePass
 
 REPORT, LATENCY, TRAJECTORY, TRACKING = "report.json", "report_latency.png", "report_flight.png", "report_tracking.png"
-SHORTEST = 0.01
-"""Smallest latency drawn, ms; shorter ones are drawn at this value, because the axis is logarithmic [choice]."""
+SHORTEST = 0.01  # ms; shorter latencies are drawn at this value, because the axis is logarithmic [choice]
 ASKED_COLOR, MEASURED_COLOR = INK, "#f2711c"
 LABELS = {
     "collective_thrust": "thrust (m/s²)",
@@ -159,8 +158,8 @@ def _summary(trajectory: Trajectory) -> dict[str, float]:
     speed = speed[np.isfinite(speed)]
     steps = np.linalg.norm(np.diff(trajectory.position.numpy().astype(float), axis=0), axis=1)
     return {
-        "gates": int((trajectory.target_gate.diff() != 0).sum()),
-        "duration_s": (len(trajectory.position) - 1) * trajectory.control_dt,
+        "gates": trajectory.gates_passed,
+        "duration_s": trajectory.duration,
         "distance_m": float(steps[np.isfinite(steps)].sum()),
         "speed_max": float(speed.max(initial=0.0)),
         "speed_mean": float(speed.mean()) if len(speed) else 0.0,
@@ -237,7 +236,8 @@ def _lines(report: dict[str, Any]) -> list[str]:
     offsets = [passed["offset_m"] for passed in report["gates"]]
     middle = f", {np.mean(offsets):.2f} m from the centre on average, {max(offsets):.2f} m at most" if offsets else ""
     lines.append(f"gates passed: {len(offsets)}{middle}")
-    lines += [f"laps ({name}): {_seconds(laps)}" for name, laps in report["laps_s"].items() if laps]
+    for name, laps in report["laps_s"].items():
+        lines += [f"laps ({name}): {', '.join(f'{lap:.2f} s' for lap in laps)}"] if laps else []
     lines += [f"{name}: {_error_text(name, error)}" for name, error in report["tracking"].items() if error]
     lines += [
         f"{name}: up to {flight['speed_max']:.1f} m/s, {flight['speed_mean']:.1f} on average, "
@@ -246,7 +246,3 @@ def _lines(report: dict[str, Any]) -> list[str]:
         if flight
     ]
     return lines + [f"note: {problem}" for problem in report["problems"]]
-
-
-def _seconds(values: Sequence[float]) -> str:
-    return ", ".join(f"{value:.2f} s" for value in values)

@@ -21,21 +21,11 @@ from dreamer_racing.hil.safety_limits import SafetyLimits
 from dreamer_racing.hil.stamping import PoseClock, Stamping
 from dreamer_racing.hil.vehicle import Pose
 
-LAG_MAX = 0.3
-"""Largest lag tried between a command and the measured motion, s [choice]."""
-
-LAG_STEP = 0.001
-"""Step between the lags tried, s [choice]."""
-
-FEWEST = 20
-"""Minimum number of measurements for a tracking error [choice]."""
-
-ACCELERATION_WINDOW = 0.04
-"""Window for the difference of velocities that gives the thrust, s [choice]: two control steps at 50 Hz."""
-
+LAG_MAX, LAG_STEP = 0.3, 0.001  # s, of the lags tried between a command and the measured motion [choice]
+FEWEST = 20  # measurements for a tracking error [choice]
+ACCELERATION_WINDOW = 0.04  # s, two control steps: for the difference of velocities that gives the thrust [choice]
 STAGES = ("jitter", "render", "act", "sent")
 """Recorded times of each tick: its delay, and the durations of its stages."""
-
 CHANNELS = {"collective_thrust": "m/s²", "body_rate_x": "rad/s", "body_rate_y": "rad/s", "body_rate_z": "rad/s"}
 """Channels of a command in order, with their units."""
 
@@ -90,18 +80,14 @@ class FlownFlight:
 
 
 class Response(NamedTuple):
-    """Commands and measurements of one channel.
-
-    Args:
-        asked_time: (T',) time at which each armed command was sent, s.
-        asked: (T',) commands; each holds until the next.
-        time: (M,) times of the measurements, s.
-        measured: (M,) measurements.
-    """
+    """Commands and measurements of one channel."""
 
     asked_time: np.ndarray
+    """(T',) time at which each armed command was sent, s."""
     asked: np.ndarray
+    """(T',) commands; each holds until the next."""
     time: np.ndarray
+    """(M,) times of the measurements, s."""
     measured: np.ndarray
 
 
@@ -131,7 +117,6 @@ def read_flown(path: Path) -> FlownFlight:
 
 
 def _clock_of(config: dict[str, Any]) -> PoseClock:
-    """Return the clock that converts the timestamps of a flight's poses."""
     drift = (config.get("limits") or {}).get("clock_drift_max")
     given = {} if drift is None else {"drift_max": float(drift)}
     return PoseClock(Stamping(config.get("stamping", "receive")), float(config.get("latency", 0.0)), **given)
@@ -221,11 +206,10 @@ def responses(flight: FlownFlight) -> dict[str, Response]:
 
 
 def tracking_error(response: Response) -> dict[str, float | None] | None:
-    """Return the RMS tracking error of a channel at the lag that minimises it.
+    """Return the RMS tracking error of a channel at the lag that minimises it; None with too few measurements.
 
-    Returns:
-        ``lag_ms``, the median of equally good lags, None if the command never changed; ``rms`` at this lag and
-        ``rms_without_lag``, in the channel's unit. None if there are fewer than ``FEWEST`` measurements.
+    ``lag_ms`` is the median of equally good lags, None if the command never changed; ``rms`` at this lag and
+    ``rms_without_lag`` are in the channel's unit.
     """
     usable = response.time >= response.asked_time[0] + LAG_MAX
     time, measured = response.time[usable], response.measured[usable]

@@ -35,11 +35,7 @@ VIEW_ANGLE = 50.0  # degrees, vertical
 
 
 def check_viser() -> None:
-    """Check that viser is installed.
-
-    Raises:
-        ValueError: it is not; the message names the extra that installs it.
-    """
+    """Raise ValueError if viser is not installed; the message names the extra that installs it."""
     if importlib.util.find_spec("viser") is None:
         raise ValueError(f"The dashboard needs the package viser: {install_extra('dashboard')}.")
 
@@ -69,13 +65,7 @@ def paints(flights: int) -> tuple[Paint, ...]:
 
 
 class RaceScene:
-    """Track, paths and drones in the scene of a viser server; `place` moves the drones.
-
-    Args:
-        server: the viser server.
-        track: the track of all flights.
-        flights: one or two flights.
-    """
+    """Track, paths and drones of one or two flights in the scene of a viser server; `place` moves the drones."""
 
     def __init__(self, server: viser.ViserServer, track: Track, flights: Sequence[Trajectory]) -> None:
         scene = server.scene
@@ -134,20 +124,11 @@ def _add_hall(scene: viser.SceneApi, track: Track) -> None:
     """Draw the floor with a grid of 1 m, and the edges of the bounding box."""
     low, high = np.array(track.bounds_low), np.array(track.bounds_high)
     width, depth, _ = high - low
-    scene.add_grid(
-        "/floor",
-        width=width,
-        height=depth,
-        plane="xy",
-        cell_size=1.0,
-        section_size=1.0,
-        cell_color=_rgb(FLOOR_LINES),
-        section_color=_rgb(FLOOR_LINES),
-        plane_color=_rgb(FLOOR_COLOR),
-        plane_opacity=1.0,
-        fade_strength=0.0,
-        position=(*((low + high) / 2)[:2], -0.01),
-    )
+    lines = _rgb(FLOOR_LINES)
+    cells: dict[str, Any] = {"cell_size": 1.0, "section_size": 1.0, "cell_color": lines, "section_color": lines}
+    ground: dict[str, Any] = {"plane_color": _rgb(FLOOR_COLOR), "plane_opacity": 1.0, "fade_strength": 0.0}
+    place = (*((low + high) / 2)[:2], -0.01)
+    scene.add_grid("/floor", width=width, height=depth, plane="xy", position=place, **cells, **ground)
     corners = np.array([[high[axis] if bits >> axis & 1 else low[axis] for axis in range(3)] for bits in range(8)])
     pairs = [(first, first | 1 << axis) for first in range(8) for axis in range(3) if not first >> axis & 1]
     edges = np.array([(corners[first], corners[second]) for first, second in pairs])  # (12, 2, 3)
@@ -233,13 +214,9 @@ def _add_camera(scene: viser.SceneApi, name: str, flight: Trajectory, color: str
 
 def _camera_attitude(tilt: float) -> tuple[float, float, float, float]:
     """Return the quaternion wxyz of a camera (x right, y down, z forwards) along body x, tilted up by degrees."""
-    import viser.transforms
-
-    cosine, sine = math.cos(math.radians(tilt)), math.sin(math.radians(tilt))
-    right, down, forwards = (0.0, -1.0, 0.0), (sine, 0.0, -cosine), (cosine, 0.0, sine)
-    attitude: Any = viser.transforms.SO3.from_matrix(np.stack((right, down, forwards), axis=1)).wxyz
-    w, x, y, z = attitude.tolist()
-    return w, x, y, z
+    cosine, sine = math.cos(math.radians(tilt) / 2), math.sin(math.radians(tilt) / 2)
+    near, far = (cosine + sine) / 2, (cosine - sine) / 2
+    return near, -far, far, -near
 
 
 def _linear(colors: np.ndarray) -> np.ndarray:

@@ -16,7 +16,7 @@ from matplotlib.figure import Figure
 from PIL import Image
 
 from dreamer_racing.envs.tracks import describe_track, load_track
-from dreamer_racing.evaluation.trajectory import Trajectory, write_trajectory
+from dreamer_racing.evaluation.trajectory import write_trajectory
 from dreamer_racing.figures.hil import LATENCY, REPORT, TRACKING, TRAJECTORY, trajectory_of, write_report
 from dreamer_racing.figures.hil_numbers import Response, read_flown, tracking_error
 from dreamer_racing.hil import recording
@@ -27,6 +27,7 @@ from dreamer_racing.hil.recording import FILE, TRACK, Flight, FlightRecorder
 from dreamer_racing.hil.safety import SafetyLimits
 from dreamer_racing.hil.stamping import Stamping
 from dreamer_racing.hil.vehicle import GRAVITY, Pose, Setpoint
+from tests.figures.test_flights import random_flight
 
 CIRCLE = load_track("circle")  # gates of 4 m from the middle, at 0, 90, 180 and 270 degrees, flown anticlockwise
 RADIUS, SPIN, ANGLE = 4.2, 2.0, -0.5  # m, rad/s, rad at the start
@@ -164,13 +165,8 @@ def test_a_track_that_is_damaged_in_the_recording_is_refused(tmp_path):
 
 def test_latencies_are_those_put_in(report):
     stages = report["latency"]["stages"]
-    for name, seconds in (
-        ("jitter", 0.0005),
-        ("render", 0.001),
-        ("act", 0.002),
-        ("pose_age", AGE),
-        ("interval", PERIOD),
-    ):
+    constant = {"jitter": 0.0005, "render": 0.001, "act": 0.002, "pose_age": AGE, "interval": PERIOD}
+    for name, seconds in constant.items():
         assert list(stages[name].values()) == pytest.approx(3 * [1e3 * seconds], abs=1e-6), name
     assert (stages["sent"]["p50_ms"], stages["sent"]["max_ms"]) == pytest.approx((4.0, 9.0))
     assert (stages["end_to_end"]["p50_ms"], stages["end_to_end"]["max_ms"]) == pytest.approx((9.0, 14.0))
@@ -201,9 +197,8 @@ def test_the_summary_of_a_flight(report):
     assert report["armed_s"] == pytest.approx(gate_time(7) - ENABLED, abs=PERIOD)
     assert report["flown"]["gates"] == 8
     assert report["flown"]["speed_max"] == pytest.approx(RADIUS * SPIN, rel=1e-4)
-    assert report["flown"]["distance_m"] == pytest.approx(
-        RADIUS * SPIN * (gate_time(7) - OFF), abs=RADIUS * SPIN * PERIOD
-    )
+    speed = RADIUS * SPIN
+    assert report["flown"]["distance_m"] == pytest.approx(speed * (gate_time(7) - OFF), abs=speed * PERIOD)
 
 
 def test_rates_follow_with_the_lag_put_in(report):
@@ -221,7 +216,7 @@ def test_thrust_is_measured_from_velocities(report):
     assert error["lag_ms"] is None and error["rms"] == pytest.approx(12.0 - GRAVITY, abs=1e-6)
 
 
-@pytest.mark.parametrize("lag", [0.0, 0.037, 0.25])
+@pytest.mark.parametrize("lag", [0.0, 0.25])
 def test_a_known_lag_is_found(lag):
     asked_time = np.arange(0.0, 5.0, 0.02)
     asked = np.random.default_rng(1).normal(size=len(asked_time))
@@ -242,18 +237,10 @@ def test_too_few_measurements_give_no_error():
 
 
 def test_the_flight_beside_a_simulated_one(tmp_path, flown, figures):
-    rows = 51
-    straight = torch.stack((torch.linspace(-2.0, 2.0, rows), torch.zeros(rows), torch.ones(rows)), dim=1)
-    simulated = Trajectory(
-        position=straight,
-        attitude=torch.tensor([1.0, 0, 0, 0]).expand(rows, 4),
-        linear_velocity=torch.tensor([4.0, 0, 0]).expand(rows, 3),
-        target_gate=torch.zeros(rows, dtype=torch.long),
-        action=torch.zeros(rows - 1, 4),
-        pixels=None,
-        control_dt=0.02,
-        outcome="timeout",
-    )
+    simulated = random_flight(steps=50, outcome="timeout")
+    simulated.position[:] = torch.stack((torch.linspace(-2.0, 2.0, 51), torch.zeros(51), torch.ones(51)), dim=1)
+    simulated.linear_velocity[:] = torch.tensor([4.0, 0, 0])
+    simulated.target_gate[:] = 0
     write_trajectory(tmp_path / "straight.csv", simulated, "circle")
     lines = write_report(flown, tmp_path / "straight.csv")
     latency, beside, tracking = figures
@@ -305,7 +292,7 @@ def test_a_flight_that_was_never_armed(tmp_path):
         write_report(tmp_path, tmp_path)
 
 
-@pytest.mark.parametrize("ticks", [1, 16, 17, 40])
+@pytest.mark.parametrize("ticks", [1, 16, 17])
 def test_flights_of_a_few_ticks(tmp_path, ticks):
     """The 16th is the first armed one."""
     lines = write_report(Flown(tmp_path).fly(ticks))
@@ -322,9 +309,8 @@ def test_a_flight_without_poses(tmp_path):
         for index in range(5):
             inputs = Inputs(PERIOD * index, [], Operator(False, False), False)
             took = dict.fromkeys(("jitter", "render", "act", "sent"), 0.0)
-            recorder.tick(
-                0.0, {"in": describe_inputs(inputs), "out": describe_outputs(chain.tick(inputs)), "took": took}
-            )
+            outputs = describe_outputs(chain.tick(inputs))
+            recorder.tick(0.0, {"in": describe_inputs(inputs), "out": outputs, "took": took})
     write_report(tmp_path / FILE)
     stages = json.loads((tmp_path / REPORT).read_text())["latency"]["stages"]
     assert stages["pose_age"] is None and stages["end_to_end"] is None and stages["render"] is None
@@ -354,7 +340,7 @@ def test_other_content_is_refused(tmp_path, about, tick):
         write_report(tmp_path)
 
 
-def test_times_out_of_order_are_refused(tmp_path, flown):
+def test_times_out_of_order_and_an_unknown_track_are_refused(tmp_path, flown):
     flight = read_flown(flown)
     assert (np.diff(flight.time) > 0).all()
     with FlightRecorder(tmp_path / FILE, {"track": "circle"}) as recorder:
@@ -362,19 +348,15 @@ def test_times_out_of_order_are_refused(tmp_path, flown):
             recorder.tick(0.0, tick)
     with pytest.raises(ValueError, match="times of ticks are not finite, or not in order"):
         write_report(tmp_path)
-
-
-def test_an_unknown_track_is_refused(tmp_path, flown):
-    with FlightRecorder(tmp_path / FILE, {"track": "nowhere"}) as recorder:
+    with FlightRecorder(tmp_path / "unknown" / FILE, {"track": "nowhere"}) as recorder:
         recorder.tick(0.0, Flight(flown).ticks[0])
     with pytest.raises(ValueError, match="nowhere"):
-        write_report(tmp_path)
+        write_report(tmp_path / "unknown")
 
 
-@pytest.mark.parametrize("share", [0.1, 0.95])
-def test_a_flight_whose_loop_was_killed(tmp_path, flown, share, unseen):
+def test_a_flight_whose_loop_was_killed(tmp_path, flown, unseen):
     data = (flown / FILE).read_bytes()
-    (tmp_path / FILE).write_bytes(data[: int(share * len(data))])
+    (tmp_path / FILE).write_bytes(data[: int(0.95 * len(data))])
     lines = write_report(tmp_path)
     assert "note: the file is incomplete: the loop was killed, or is still running" in lines
 
