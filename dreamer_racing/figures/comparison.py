@@ -22,23 +22,17 @@ COLUMNS = (*(QUANTITIES[name].column for name in COMPARED), *filter(None, (axis.
 
 @dataclass(frozen=True)
 class VariantResult:
-    """Results of the runs of one variant.
-
-    Args:
-        key: algorithm, track and variant.
-        seeds: S, number of runs that reach the window.
-        values: each run's mean over the window, by name in ``COMPARED``, (S,) or fewer if runs have no value there;
-            quantities that no run has logged are left out.
-        window: start and end of the averaging window on the axis, common to all variants of the algorithm on the
-            track.
-        wall_clock: mean duration of these runs, s; None if no run recorded it.
-    """
+    """Results of the runs of one variant."""
 
     key: CurveKey
     seeds: int
+    """S, number of runs that reach the window."""
     values: dict[str, np.ndarray]
+    """Each run's mean over the window, by name in `COMPARED`, if any has logged it: (S,), or fewer without a value."""
     window: tuple[float, float]
+    """Start and end on the axis, common to all variants of the algorithm on the track."""
     wall_clock: float | None
+    """Mean duration of these runs, s; None if no run recorded it."""
 
     @property
     def name(self) -> str:
@@ -71,12 +65,8 @@ def compare_variants(runs: Sequence[RunData], problems: Sequence[str] = (), axis
     """Average runs over a final window and the seeds of each variant, sorted with the reference first, then by name.
 
     The window is the same for all variants of an algorithm on a track. It ends at the env_steps of the longest run, or
-    on a time axis at the time that every variant has reached, so that no variant has more time than another.
-
-    Args:
-        runs: runs of any algorithms and tracks.
-        problems: lines for what was left out before.
-        axis: one of `AXES`.
+    on a time axis at the time that every variant has reached, so that no variant has more time than another. Add
+    ``problems``, lines for what was left out before.
 
     Raises:
         ValueError: there are no runs, or two runs of one variant have the same seed.

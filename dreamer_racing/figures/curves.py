@@ -10,6 +10,7 @@ import math
 from collections import defaultdict
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import NamedTuple
 
@@ -19,7 +20,7 @@ from dreamer_racing.figures.runs import AXES, CurveKey, RunData, along, axis_of,
 from dreamer_racing.settings import check_choice
 
 CURVES = "learning_curves.csv"
-POINTS = 240  # P
+POINTS, DRAWS = 240, 2000  # P, D
 WINDOW_SHARE = 0.02  # default window of the running mean, as a share of the longest run
 GAPS = "where a seed has no value, the mean of the others; a gap where fewer than half of the seeds have one"
 ENDS_EARLY = 0.98  # runs that end before this share of a curve's longest run are reported
@@ -194,11 +195,7 @@ def sample(group: Sequence[RunData], column: str, grid: np.ndarray, window: floa
 
 
 def measurements(run: RunData, column: str) -> tuple[np.ndarray, np.ndarray]:
-    """Return a column, with NaN for every evaluation without a value, for instance a lap time without a lap.
-
-    Returns:
-        Sorted env_steps and values, (R,) each; empty if there are none.
-    """
+    """Return sorted env_steps and values of a column, (R,) each, with NaN for every evaluation without a value."""
     columns = run.metrics.columns
     steps, values = columns.get(column, (np.empty(0), np.empty(0)))
     evaluated = [columns[name][0] for name in _evaluation_markers(column) if name in columns]
@@ -209,17 +206,10 @@ def measurements(run: RunData, column: str) -> tuple[np.ndarray, np.ndarray]:
 
 
 def resample(steps: np.ndarray, values: np.ndarray, grid: np.ndarray, window: float) -> np.ndarray:
-    """Compute the running mean of a metric on a grid of env_steps.
+    """Compute the running mean of values (R,) at sorted env_steps (R,) on a grid of env_steps, (P,).
 
-    Args:
-        steps: (R,) sorted env_steps of the values.
-        values: (R,); NaN where the metric was measured without a value.
-        grid: (P,) env_steps to return values for.
-        window: width of the window, env_steps.
-
-    Returns:
-        (P,): the mean over the window at each row, interpolated linearly between rows, so that windows with few rows
-        cause no steps. NaN beyond the ends, and beside a row without a value if the window contains no value.
+    It is the mean over the window at each row, interpolated linearly between rows, so that windows with few rows cause
+    no steps. NaN beyond the ends, and beside a row without a value (NaN) if the window contains no value.
     """
     if not len(steps):
         return np.full(len(grid), np.nan)
@@ -260,10 +250,7 @@ def interquartile_mean(scores: np.ndarray) -> np.ndarray:
 
 
 def bootstrap_interval(
-    strata: Sequence[np.ndarray],
-    statistic: Callable[[np.ndarray], np.ndarray] = interquartile_mean,
-    draws: int = 2000,
-    seed: int = 0,
+    strata: Sequence[np.ndarray], statistic: Callable[[np.ndarray], np.ndarray] = interquartile_mean
 ) -> np.ndarray:
     """Return a stratified percentile-bootstrap interval of a statistic; every track keeps its number of runs.
 
@@ -273,14 +260,12 @@ def bootstrap_interval(
     Args:
         strata: the runs of each track, (S, P).
         statistic: function of an array (S, ...) along its first axis.
-        draws: D.
-        seed: seed of the draws.
 
     Returns:
-        (2, P): the 2.5 and the 97.5 percentile.
+        (2, P): the 2.5 and the 97.5 percentile of D draws.
     """
-    generator = np.random.default_rng(seed)
-    pooled = [stratum[generator.integers(len(stratum), size=(len(stratum), draws))] for stratum in strata]
+    generator = np.random.default_rng(0)
+    pooled = [stratum[generator.integers(len(stratum), size=(len(stratum), DRAWS))] for stratum in strata]
     return np.percentile(statistic(np.concatenate(pooled)), (2.5, 97.5), axis=0)  # of (D, P)
 
 
@@ -289,11 +274,7 @@ def _deviation_band(strata: Sequence[np.ndarray]) -> np.ndarray:
     return pooled.mean(0) + np.array([[-1.0], [1.0]]) * pooled.std(0, ddof=1)
 
 
-def _mean(scores: np.ndarray) -> np.ndarray:
-    return scores.mean(0)
-
-
-AGGREGATES = {"mean": (_mean, _deviation_band), "iqm": (interquartile_mean, bootstrap_interval)}
+AGGREGATES = {"mean": (partial(np.mean, axis=0), _deviation_band), "iqm": (interquartile_mean, bootstrap_interval)}
 """Functions for the centre, from runs (S, P), and for the band (2, P), from runs by track."""
 
 

@@ -21,15 +21,9 @@ REASON_LETTERS = 160  # maximum length of the reason why a file cannot be read
 
 
 def evaluation_files(directory: Path, ending: str) -> list[Path]:
-    """Find the files of a run's evaluations, during training and by `recipes/evaluate.py` after it.
+    """Find the files of a run's evaluations of the deterministic policy, by their ending.
 
-    Args:
-        directory: the run directory.
-        ending: suffix of the file names, after the env_steps or the policy's name.
-
-    Returns:
-        The files: first those of training, sorted by env_steps, then those of `evaluation`, `evaluation_2` ...; files
-        of stochastic policies are left out.
+    First those of training, sorted by env_steps, then those of `recipes/evaluate.py`: `evaluation`, `evaluation_2` ...
     """
     files = RunDirectory(directory).evaluations.glob(f"*{ending}")
     during = {int(name): file for file in files if (name := file.name.removesuffix(ending)).isdigit()}
@@ -47,22 +41,19 @@ def stored_flights(folder: Path) -> list[Path]:
     return [file for place in places for name in STORED if (file := place / f"{name}{NUMBERS}").is_file()]
 
 
-def evaluation_score(file: Path, ending: str) -> tuple[float, float]:
-    """Return the score of a file's evaluation, (gates per episode, mean return); −∞ if it cannot be read."""
+def evaluation_score(flight: Path) -> tuple[float, float]:
+    """Return the score of a flight's evaluation, (gates per episode, mean return); −∞ if it cannot be read."""
     try:
-        numbers = json.loads(file.with_name(f"{file.name.removesuffix(ending)}.json").read_text(encoding="utf-8"))
+        numbers = json.loads(flight.with_name(f"{flight.name.removesuffix(NUMBERS)}.json").read_text(encoding="utf-8"))
         return float(numbers["gates_per_episode"]), float(numbers["return_mean"])
     except (OSError, ValueError, KeyError, TypeError):
         return -math.inf, -math.inf
 
 
 def first_readable(files: Iterable[Path], read: Callable[[Path], T], problems: list[str]) -> tuple[Path, T] | None:
-    """Read the first readable file among files of a run's evaluations.
+    """Read the first of a run's evaluation files that ``read`` can, without a ValueError or OSError.
 
-    Args:
-        files: the files, in order of preference.
-        read: function that reads a file and raises ValueError or OSError if it cannot.
-        problems: gets a line if files were skipped, with the run, the first of these files and the reason.
+    If files were skipped, ``problems`` gets a line with the run, the first of these files and the reason.
 
     Returns:
         The file and its content; None if no file can be read.

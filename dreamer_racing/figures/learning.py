@@ -21,7 +21,7 @@ from matplotlib.ticker import EngFormatter, MaxNLocator
 
 from dreamer_racing.figures.comparison import Comparison, VariantResult
 from dreamer_racing.figures.curves import ALL_TRACKS, ENDS_EARLY, QUANTITIES, Curve, LearningCurves
-from dreamer_racing.figures.drawing import INK, MUTED, NOTE_LETTERS, dress, save
+from dreamer_racing.figures.drawing import INK, MUTED, NOTE_LETTERS, Style, dress, save
 from dreamer_racing.figures.runs import CurveKey, axis_of
 
 ALGORITHMS = {
@@ -42,10 +42,10 @@ BANDS = {
     "iqm": ("interquartile mean", "95 % bootstrap interval"),
 }
 DRAWN = ("gates", "evaluation_return")  # panels of the comparison
-Styles = dict[CurveKey, dict[str, Any]]
+Styles = dict[CurveKey, Style]
 COUNT_ROOM = 0.12  # space for n right of the longest bar, as a share of the axis
-SMALL: dict[str, Any] = {"fontsize": 8, "color": MUTED}
-ERROR: dict[str, Any] = {"ecolor": INK, "elinewidth": 1.4, "capsize": 3.0}
+SMALL: Style = {"fontsize": 8, "color": MUTED}
+ERROR: Style = {"ecolor": INK, "elinewidth": 1.4, "capsize": 3.0}
 REFERENCE_COLOR = "#1971c2"  # light, so that the error bar is visible
 OTHER_COLOR = "#a5d8ff"  # of other variants
 
@@ -57,14 +57,10 @@ def plot_learning_curves(curves: LearningCurves, path: str | Path) -> None:
 
     Reference: paper, Fig. "Reward evolution".
 
-    Args:
-        curves: the learning curves.
-        path: the file to write; missing folders are created.
-
     Raises:
         ValueError: an algorithm has more variants than there are line styles.
     """
-    tracks = _in_order({curve.key.track for curve in curves.curves} | {key.track for key in curves.raises}, TRACKS)
+    tracks = sorted({curve.key.track for curve in curves.curves} | {key.track for key in curves.raises}, key=_place)
     quantities = list(dict.fromkeys(curve.quantity for curve in curves.curves))
     keys = sorted({curve.key._replace(track="") for curve in curves.curves}, key=_rank)
     styles = line_styles(keys)
@@ -97,7 +93,7 @@ def plot_learning_curves(curves: LearningCurves, path: str | Path) -> None:
                 axes.set_xlabel(axis_of(curves.axis).label, color=INK)
     handles = [Line2D([], [], label=labels[key], **styles[key]) for key in keys]
     if any(map(len, curves.raises.values())):
-        tick: dict[str, Any] = {"marker": "|", "markersize": 8, "linestyle": "", "color": MUTED}
+        tick: Style = {"marker": "|", "markersize": 8, "linestyle": "", "color": MUTED}
         handles.append(Line2D([], [], label="the curriculum raises b₂", **tick))
     _draw_legend(figure.add_subplot(grid[-1, :]), handles, "\n".join(caption), columns)
     save(figure, path, curves.problems)
@@ -146,23 +142,15 @@ def _draw_raises(axes: Axes, curves: LearningCurves, track: str, styles: Styles)
     """Draw a short tick for every rise of b₂; each curve with rises has its own height above the axis."""
     raised = [key for key in styles if len(curves.raises.get(key._replace(track=track), ()))]
     for level, key in enumerate(raised):
-        bottom = 0.012 + 0.05 * level
-        steps = curves.raises[key._replace(track=track)]
-        axes.vlines(
-            steps,
-            bottom,
-            bottom + 0.04,
-            colors=[styles[key]["color"]],
-            linewidth=1.0,
-            alpha=0.8,
-            transform=axes.get_xaxis_transform(),
-        )
+        steps, bottom = curves.raises[key._replace(track=track)], 0.012 + 0.05 * level
+        look: Style = {"colors": [styles[key]["color"]], "linewidth": 1.0, "alpha": 0.8}
+        axes.vlines(steps, bottom, bottom + 0.04, transform=axes.get_xaxis_transform(), **look)
 
 
 def _draw_legend(axes: Axes, handles: Sequence[Line2D], caption: str, columns: int) -> None:
     """Draw legend and caption below the panels."""
     axes.set_axis_off()
-    style: dict[str, Any] = {"frameon": False, "fontsize": 9, "borderaxespad": 0.0, "labelcolor": INK}
+    style: Style = {"frameon": False, "fontsize": 9, "borderaxespad": 0.0, "labelcolor": INK}
     legend = axes.legend(handles=handles, loc="upper left", ncols=columns, title=caption, alignment="left", **style)
     legend.get_title().set(fontsize=9, color=MUTED)
 
@@ -192,7 +180,7 @@ def _seed_count(curves: LearningCurves, key: CurveKey) -> str:
     }
     if len(set(texts.values())) == 1:
         return next(iter(texts.values()))
-    return "; ".join(f"{_track_title(track)}: {texts[track]}" for track in _in_order(set(texts), TRACKS))
+    return "; ".join(f"{_track_title(track)}: {texts[track]}" for track in sorted(texts, key=_place))
 
 
 def _seeds_at_the_end(curve: Curve) -> int:
@@ -202,18 +190,12 @@ def _seeds_at_the_end(curve: Curve) -> int:
 
 
 def _label(key: CurveKey) -> str:
-    name = ALGORITHMS.get(key.algorithm, (key.algorithm, MUTED))[0]
+    name, _ = ALGORITHMS.get(key.algorithm, (key.algorithm, MUTED))
     return ", ".join(filter(None, (name, key.variant)))
 
 
 def line_styles(keys: Sequence[CurveKey]) -> Styles:
-    """Choose a distinct line style for each curve: the algorithm's colour, darker or lighter, and dashes.
-
-    Args:
-        keys: keys without tracks, in the order of the legend.
-
-    Returns:
-        Options of matplotlib's lines by key.
+    """Choose a distinct line style for each key without track: the algorithm's colour, darker or lighter, and dashes.
 
     Raises:
         ValueError: an algorithm has more variants than there are line styles.
@@ -221,7 +203,7 @@ def line_styles(keys: Sequence[CurveKey]) -> Styles:
     return {key: _line_style(key, [other for other in keys if other.algorithm == key.algorithm]) for key in keys}
 
 
-def _line_style(key: CurveKey, own: Sequence[CurveKey]) -> dict[str, Any]:
+def _line_style(key: CurveKey, own: Sequence[CurveKey]) -> Style:
     lines, shades = len(VARIANT_LINES), len(VARIANT_SHADES)
     if len(own) > lines * shades:
         raise ValueError(
@@ -246,12 +228,9 @@ def _rank(key: CurveKey) -> tuple[int, bool, CurveKey]:
     return names.index(key.algorithm) if key.algorithm in names else len(names), not key.is_reference, key
 
 
-def _in_order(names: set[str], first: Sequence[str]) -> list[str]:
-    """Sort names: first those in ``first``, then the others alphabetically, then `ALL_TRACKS`."""
-    return sorted(
-        names,
-        key=lambda name: (name == ALL_TRACKS, name not in first, *([first.index(name)] if name in first else []), name),
-    )
+def _place(track: str) -> tuple[bool, int, str]:
+    """Return a sort key: the paper's tracks, then others alphabetically, then `ALL_TRACKS`."""
+    return track == ALL_TRACKS, TRACKS.index(track) if track in TRACKS else len(TRACKS), track
 
 
 def _track_title(track: str) -> str:
@@ -262,10 +241,6 @@ def plot_comparison(comparison: Comparison, path: str | Path) -> None:
     """Draw a bar per variant with the standard deviation over n seeds, a dot per seed, and a line at the reference.
 
     Quantities that may be negative have a diamond instead of the bar.
-
-    Args:
-        comparison: the comparison.
-        path: the file to write; missing folders are created.
     """
     results = comparison.results
     shown = [name for name in DRAWN if any(name in result.values for result in results)]
@@ -280,8 +255,7 @@ def plot_comparison(comparison: Comparison, path: str | Path) -> None:
         axes.set_title(QUANTITIES[name].label, loc="left", fontsize=10, color=INK)
         low, high = _limits(name, axes.get_xlim())
         axes.set_xlim(low, high + COUNT_ROOM * (high - low))
-        dress(axes)
-        axes.grid(axis="y", visible=False)
+        dress(axes, "x")
     names = [" ".join([*(result.key[:2][::-1] if several else ()), result.name]) for result in results]
     panels[0].set_yticks(np.arange(len(results)), names)
     panels[0].invert_yaxis()

@@ -51,11 +51,7 @@ class LoggerConfig:
     every: int = setting(2_000, NOT_NEGATIVE)  # env_steps between rows
 
     def check(self) -> None:
-        """Check that W&B is installed if it is configured.
-
-        Raises:
-            ValueError: it is not installed.
-        """
+        """Raise ValueError if W&B is configured but not installed."""
         if self.wandb is not Wandb.none and importlib.util.find_spec("wandb") is None:
             raise ValueError(
                 f"logger.wandb={self.wandb.value} needs the package wandb: {install_extra('wandb')}, or "
@@ -64,10 +60,10 @@ class LoggerConfig:
 
 
 def make_loggers(run_dir: str | Path, config: LoggerConfig, resume_env_steps: int | None = None) -> list[RunLogger]:
-    """Make the loggers of a run.
+    """Make the loggers of a run, which write to its folders ``tensorboard`` and ``wandb``.
 
     Args:
-        run_dir: the run directory; loggers write to its folders ``tensorboard`` and ``wandb``.
+        run_dir: the run directory.
         config: settings of the loggers.
         resume_env_steps: env_steps of the checkpoint that the run resumes from; None for a new run.
 
@@ -78,17 +74,12 @@ def make_loggers(run_dir: str | Path, config: LoggerConfig, resume_env_steps: in
     loggers: list[RunLogger] = [TensorboardRunLogger(run_dir, resume_env_steps)] if config.tensorboard else []
     if config.wandb is not Wandb.none:
         offline, resumed = config.wandb is Wandb.offline, resume_env_steps is not None
-        loggers.append(WandbRunLogger(run_dir, config.project, offline, resumed=resumed))
+        loggers.append(WandbRunLogger(run_dir, config.project, offline, resumed))
     return loggers
 
 
 class TensorboardRunLogger(TensorboardLogger):
-    """TensorBoard files of a run; on resumption, entries after the checkpoint are purged.
-
-    Args:
-        run_dir: the run directory.
-        resume_env_steps: env_steps of the checkpoint that the run resumes from; None for a new run.
-    """
+    """TensorBoard files of a run; on resumption, entries after the checkpoint are purged."""
 
     def __init__(self, run_dir: str | Path, resume_env_steps: int | None = None) -> None:
         self._resume_env_steps = resume_env_steps
@@ -138,16 +129,12 @@ class TensorboardRunLogger(TensorboardLogger):
 
 
 class WandbRunLogger(WandbLogger):
-    """A run of Weights & Biases, which a resumed run continues.
+    """A run of Weights & Biases with its files and id in ``run_dir/wandb``, which a resumed run continues.
 
-    Args:
-        run_dir: the run directory; files and id of the W&B run are in ``run_dir/wandb``.
-        project: the W&B project.
-        offline: whether to send nothing to the server; `wandb sync` sends it later.
-        resumed: whether the run is resumed, and so keeps its W&B id if it has one.
+    If ``offline``, nothing is sent to the server; `wandb sync` sends it later.
     """
 
-    def __init__(self, run_dir: str | Path, project: str, offline: bool, resumed: bool = False) -> None:
+    def __init__(self, run_dir: str | Path, project: str, offline: bool, resumed: bool) -> None:
         place = RunDirectory(Path(run_dir)).wandb_run
         place.parent.mkdir(parents=True, exist_ok=True)
         if not (resumed and place.exists()):

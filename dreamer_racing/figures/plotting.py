@@ -10,11 +10,10 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from dreamer_racing.evaluation.dreams import Dream
-from dreamer_racing.evaluation.trajectory import read_trajectory
+from dreamer_racing.evaluation.trajectory import NUMBERS, read_trajectory
 from dreamer_racing.figures.comparison import COLUMNS, compare_variants, comparison_table
 from dreamer_racing.figures.curves import (
     CURVES,
-    LearningCurves,
     curves_file,
     learning_curves,
     read_curves,
@@ -27,13 +26,7 @@ from dreamer_racing.figures.flights import NamedFlight, plot_dreams, plot_flight
 from dreamer_racing.figures.hud import dream_video
 from dreamer_racing.figures.learning import plot_comparison, plot_learning_curves
 from dreamer_racing.figures.profiles import PROFILE_AXES
-from dreamer_racing.figures.runs import (
-    RunData,
-    find_runs,
-    first_of_each_curve,
-    group_runs,
-    read_runs,
-)
+from dreamer_racing.figures.runs import RunData, find_runs, first_of_each_curve, group_runs, read_runs
 from dreamer_racing.settings import NOT_NEGATIVE, check_choice, check_settings, setting
 from dreamer_racing.training.directory import RunDirectory, ensure_writable
 
@@ -92,7 +85,7 @@ def draw(config: PlotConfig) -> None:
     places = as_list(config.runs)
     if len(places) == 1 and (file := curves_file(places[0])):
         refuse_for_curves(config)
-        draw_curves(read_curves(file), output)
+        plot_learning_curves(read_curves(file), output / "learning_curves.png")
         logger.info("learning_curves:  learning_curves.png, with the quantities and statistics of the file")
         return
     named = [name for name, files in (("trajectories", config.flights), ("imagined", config.dreams)) if files]
@@ -190,13 +183,8 @@ def draw_learning_curves(config: PlotConfig, output: Path, runs: list[RunData], 
     """Write `learning_curves.png` and `.csv`."""
     curves = learning_curves(runs, config.quantities, config.aggregate.value, config.window, problems, config.axis)
     write_curves(output / CURVES, curves)
-    draw_curves(curves, output)
-    return Drawn(["learning_curves.png", CURVES], curves.problems)
-
-
-def draw_curves(curves: LearningCurves, output: Path) -> None:
-    """Write `learning_curves.png`."""
     plot_learning_curves(curves, output / "learning_curves.png")
+    return Drawn(["learning_curves.png", CURVES], curves.problems)
 
 
 def draw_imagined(config: PlotConfig, output: Path, runs: list[RunData], problems: list[str]) -> Drawn:
@@ -249,26 +237,17 @@ def draw_trajectories(config: PlotConfig, output: Path, runs: list[RunData], pro
 
 
 def chosen_flights(runs: list[RunData], which: str, problems: list[str]) -> list[NamedFlight]:
-    """Read the last or the best flight of the first seed of each curve, or the next one if it cannot be read.
-
-    Args:
-        runs: runs of any curves.
-        which: ``last`` or ``best``.
-        problems: gets a line for every file that cannot be read.
-    """
+    """Read the last or the best flight of the first seed of each curve, or the next one if it cannot be read."""
     flights = []
     for run in first_of_each_curve(runs):
-        found = first_readable(stored_flights(run, which), named_flight, problems)
+        files = evaluation_files(run.directory, NUMBERS)
+        if which == "last":
+            files.reverse()
+        else:
+            files.sort(key=evaluation_score, reverse=True)
+        found = first_readable(files, named_flight, problems)
         flights += [found[1]] if found else []
     return flights
-
-
-def stored_flights(run: RunData, which: str) -> list[Path]:
-    """Return the flight files of a run, sorted from the last or the best on."""
-    files = evaluation_files(run.directory, "_trajectory.csv")[:: -1 if which == "last" else 1]
-    if which == "best":
-        files.sort(key=lambda file: evaluation_score(file, "_trajectory.csv"), reverse=True)
-    return files
 
 
 def named_flight(file: str | Path) -> NamedFlight:
@@ -303,11 +282,6 @@ def draw_comparison(config: PlotConfig, output: Path, runs: list[RunData], probl
     return Drawn(["comparison.md", "comparison.png"], comparison.problems)
 
 
-def no_columns(config: PlotConfig) -> Iterable[str]:
-    """Return no columns, for figures that do not use `metrics.csv`."""
-    return ()
-
-
 class Entry(NamedTuple):
     """A figure of the setting `figure`: its function and the columns that it needs."""
 
@@ -319,7 +293,7 @@ class Entry(NamedTuple):
 
 FIGURES = {
     "learning_curves": Entry(draw_learning_curves, lambda config: wanted_columns(config.quantities, config.axis)),
-    "imagined": Entry(draw_imagined, no_columns),
-    "trajectories": Entry(draw_trajectories, no_columns),
+    "imagined": Entry(draw_imagined, lambda config: ()),
+    "trajectories": Entry(draw_trajectories, lambda config: ()),
     "comparison": Entry(draw_comparison, lambda config: COLUMNS),
 }

@@ -7,8 +7,9 @@ import hashlib
 import os
 import re
 from collections import defaultdict
-from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import partial
 from itertools import combinations, groupby, pairwise
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -23,8 +24,6 @@ from dreamer_racing.training.directory import RunDirectory
 from dreamer_racing.training.metrics import MetricsTable, read_metrics
 
 DEFAULT_ALGORITHM = "dreamer_v3"  # for configurations without `algorithm`
-PPO_ACTORS = ("flown_ppo", "latent_ppo", "asymmetric_ppo")
-"""Values of loss.actor in older runs of the algorithm now named latent_ppo."""
 LOGGED_BY = (
     ("imagined_reward", "dreamer_v3"), ("loss_dynamics", "latent_ppo"), ("alpha", "sac"), ("clip_fraction", "ppo"),
 )  # fmt: skip
@@ -87,19 +86,15 @@ class CurveKey(NamedTuple):
 
 @dataclass(frozen=True)
 class RunData:
-    """Content of a run directory, or of a metrics table that was kept without one.
-
-    Args:
-        directory: the run directory, or the file of the metrics table.
-        config: settings of `config.yaml` by dotted name; empty for a metrics table.
-        metrics: content of `metrics.csv`.
-        overrides: settings of the command line as text, by dotted name; empty if they were not stored.
-    """
+    """Content of a run directory, or of a metrics table that was kept without one."""
 
     directory: Path
+    """The run directory, or the file of the metrics table."""
     config: dict[str, Any]
+    """Settings of `config.yaml` by dotted name; empty for a metrics table."""
     metrics: MetricsTable
     overrides: dict[str, str] = field(default_factory=dict)
+    """Settings of the command line as text, by dotted name; empty if they were not stored."""
 
     @property
     def name(self) -> str:
@@ -123,8 +118,6 @@ class RunData:
         scene = "task" if self.config.get("env.suite") == "dmc" else "track"
         track = Path(str(self.config.get(scene, "unknown"))).stem
         named = re.fullmatch(rf"{re.escape(f'{algorithm}_{track}')}(?:_(?P<variant>.+))?_seed\d+", self.name)
-        if algorithm == DEFAULT_ALGORITHM and self.config.get("loss.actor") in PPO_ACTORS:
-            algorithm = "latent_ppo"
         return CurveKey(track, algorithm, (named and named["variant"]) or "")
 
 
@@ -189,9 +182,7 @@ def runs_below(folder: Path) -> Iterator[Path]:
 def read_runs(directories: Sequence[Path], wanted: Collection[str] | None = None) -> tuple[list[RunData], list[str]]:
     """Read runs without unreadable ones; of runs with the same settings and seed, keep the one with most env_steps.
 
-    Args:
-        directories: run directories and metrics tables.
-        wanted: names of the columns of `metrics.csv` to read; None for all.
+    Reads the ``wanted`` columns of `metrics.csv`, None for all.
 
     Returns:
         The runs, and a line with run and reason for everything left out.
@@ -284,15 +275,10 @@ def group_runs(runs: Sequence[RunData]) -> dict[CurveKey, list[RunData]]:
 
 
 def along(runs: Sequence[RunData], axis: str) -> tuple[list[RunData], list[str]]:
-    """Convert the metrics of runs from env_steps to another axis.
-
-    Args:
-        runs: runs with the column of the axis's clock.
-        axis: a name in `AXES`.
+    """Replace env_steps in the tables of runs by positions on another axis.
 
     Returns:
-        The runs, with env_steps in their tables replaced by positions on the axis, and a line for each run that is left
-        out because it lacks the clock.
+        The runs, and a line for each run that is left out because it lacks the axis's clock.
     """
     clock = axis_of(axis).clock
     if clock is None:
@@ -302,15 +288,15 @@ def along(runs: Sequence[RunData], axis: str) -> tuple[list[RunData], list[str]]
         if clock not in run.metrics.columns:
             problems.append(f"{run.name} left out: it has no {clock}, which axis={axis} needs")
             continue
-        hours = _hours(*run.metrics.columns[clock])
+        hours = partial(_hours, *run.metrics.columns[clock])
         columns = {name: (hours(steps), values) for name, (steps, values) in run.metrics.columns.items()}
         kept.append(replace(run, metrics=replace(run.metrics, columns=columns, env_steps=hours(run.metrics.env_steps))))
     return kept, problems
 
 
-def _hours(steps: np.ndarray, seconds: np.ndarray) -> Callable[[np.ndarray], np.ndarray]:
-    """Return a function from env_steps to hours, by linear interpolation of a clock."""
-    return lambda env_steps: np.interp(env_steps, steps, seconds / 3600.0)
+def _hours(steps: np.ndarray, seconds: np.ndarray, env_steps: np.ndarray) -> np.ndarray:
+    """Convert env_steps to hours, by linear interpolation of a clock."""
+    return np.interp(env_steps, steps, seconds / 3600.0)
 
 
 def first_of_each_curve(runs: Sequence[RunData]) -> list[RunData]:
@@ -334,11 +320,12 @@ def _split_by_settings(runs: Sequence[RunData]) -> list[list[RunData]]:
     """Split runs into parts with equal settings: each run joins the first part that it equals."""
     parts: list[list[RunData]] = []
     for run in runs:
-        like = (part for part in parts if not any(_differing_settings(run.config, other.config) for other in part))
-        if (part := next(like, None)) is None:
-            parts.append([run])
+        for part in parts:
+            if not any(_differing_settings(run.config, other.config) for other in part):
+                part.append(run)
+                break
         else:
-            part.append(run)
+            parts.append([run])
     return parts
 
 
@@ -361,11 +348,11 @@ def _difference_labels(parts: Sequence[Sequence[RunData]]) -> list[str]:
     configs = [_relevant({name: value for run in part for name, value in run.config.items()}) for part in parts]
     pairs = combinations(configs, 2)
     different = sorted({name for first, second in pairs for name in _differing_settings(first, second)})
-    counts = range(1, len(different) + 1)
-    if (enough := next((n for n in counts if _labels_are_unique(configs, different[:n])), None)) is None:
-        return [f"({number})" for number in range(1, len(parts) + 1)]  # they differ only in settings of every key
-    more = ", …" if enough < len(different) else ""
-    return [f"{label}{more}" for label in _name_by(configs, different[:enough])]
+    for enough in range(1, len(different) + 1):
+        labels = _name_by(configs, different[:enough])
+        if len(set(labels)) == len(labels):
+            return [f"{label}, …" for label in labels] if enough < len(different) else labels
+    return [f"({number})" for number in range(1, len(parts) + 1)]  # they differ only in settings of every key
 
 
 def _relevant(settings: Mapping[str, Any]) -> dict[str, Any]:
@@ -374,7 +361,3 @@ def _relevant(settings: Mapping[str, Any]) -> dict[str, Any]:
 
 def _name_by(settings: Sequence[Mapping[str, Any]], names: Sequence[str]) -> list[str]:
     return [", ".join(f"{name}={one[name]}" for name in names if name in one) for one in settings]
-
-
-def _labels_are_unique(settings: Sequence[Mapping[str, Any]], names: Sequence[str]) -> bool:
-    return len(set(_name_by(settings, names))) == len(settings)

@@ -10,7 +10,6 @@ import yaml
 
 from dreamer_racing.figures.curves import (
     ALL_TRACKS,
-    QUANTITIES,
     bootstrap_interval,
     interquartile_mean,
     learning_curves,
@@ -56,6 +55,12 @@ def test_running_mean_between_and_beyond_rows():
     values[2] = np.nan  # looked for at 30, and not found
     expected = [np.nan, 1, (1 + 2) / 2, np.nan, 12, np.nan]
     np.testing.assert_allclose(resample(steps, values, grid, window=20.0), expected)
+
+
+def test_a_short_run_is_drawn_without_steps():
+    steps, grid = np.arange(1.0, 21.0) * 500, np.linspace(500, 10_000, 240)
+    np.testing.assert_allclose(resample(steps, steps, grid, window=200.0), grid)  # 2 % of the run: less than a row
+    np.testing.assert_allclose(resample(steps, steps, grid, window=1400.0)[30:-30], grid[30:-30])  # two or three rows
 
 
 def test_mean_and_standard_deviation_over_seeds(tmp_path):
@@ -124,18 +129,12 @@ def test_a_seed_that_never_flew_a_lap_counts_as_one_without(tmp_path):
     assert "no values of evaluation/lap_time_mean: ppo_circle_seed1, ppo_circle_seed2" in result.problems
 
 
-def test_both_policies_can_be_drawn(tmp_path):
+def test_the_stochastic_policy_can_be_drawn(tmp_path):
     run = write_run(tmp_path, "ppo_circle_seed0", algorithm="ppo")
-    names = [
-        f"evaluation{policy}/{name}" for policy in ("", "_stochastic") for name in ("success_rate", "gates_per_episode")
-    ]
-    (run / "metrics.csv").write_text(f"env_steps,{','.join(names)}\n1000,1,12,0.5,7\n2000,1,12,0.5,7\n")
-    quantities = ["success_rate", "gates", "stochastic_success_rate", "stochastic_gates"]
-    curves = curves_of(tmp_path, quantities=quantities).curves
-    assert [(curve.quantity, curve.centre[-1]) for curve in curves] == list(
-        zip(quantities, (1, 12, 0.5, 7), strict=True)
-    )
-    assert QUANTITIES["stochastic_success_rate"].comparable
+    columns = "evaluation_stochastic/success_rate,evaluation_stochastic/gates_per_episode"
+    (run / "metrics.csv").write_text(f"env_steps,{columns}\n1000,0.5,7\n2000,0.5,7\n")
+    rate, gates = curves_of(tmp_path, quantities=["stochastic_success_rate", "stochastic_gates"]).curves
+    assert (rate.centre[-1], gates.centre[-1]) == (0.5, 7.0)
 
 
 def test_interquartile_mean_is_that_of_the_middle_half():
@@ -189,11 +188,8 @@ def test_curves_survive_their_file(tmp_path, window):
     before = curves_of(tmp_path / "runs", window=window)
     write_curves(tmp_path / "curves.csv", before)
     after = read_curves(tmp_path / "curves.csv")
-    assert (after.aggregate, after.window, after.problems) == (
-        "mean",
-        window or 0.02 * 2000,
-        before.problems,
-    ) and before.problems
+    assert (after.aggregate, after.window) == ("mean", window or 0.02 * 2000)
+    assert after.problems == before.problems != []
     for old, new in zip(before.curves, after.curves, strict=True):
         assert (old.key, old.quantity) == (new.key, new.quantity)
         np.testing.assert_array_equal(old.seeds, new.seeds)
@@ -263,8 +259,6 @@ def test_runs_are_found_but_not_inside_of_runs(tmp_path):
          ("figure8_decoys", "ppo", "no_noise")),
         ("sac_mine_seed0", {"algorithm": "sac", "track": "tracks/mine.yaml"}, ("mine", "sac", "")),
         ("dreamer_v3_circle_20260101-120000", {}, ("circle", "dreamer_v3", "")),
-        ("dreamer_v3_circle_old_seed0", {"algorithm": "dreamer_v3", "loss": {"actor": "asymmetric_ppo"}},
-         ("circle", "latent_ppo", "old")),
         ("dreamer_v3_cartpole_swingup_wide_seed0", {"task": "cartpole_swingup", "env": {"suite": "dmc"}},
          ("cartpole_swingup", "dreamer_v3", "wide")),
     ],
@@ -358,7 +352,6 @@ def test_of_the_same_seed_twice_the_longer_run_counts(tmp_path):
         (lambda run: (run / "config.yaml").unlink(), "it has no config.yaml"),
         (lambda run: (run / "metrics.csv").write_text(""), "metrics.csv has no rows"),
         (lambda run: (run / "metrics.csv").write_text("env_steps,episode/return\n"), "metrics.csv has no rows"),
-        (lambda run: (run / "metrics.csv").write_text("env_st"), "metrics.csv has no rows"),
         (lambda run: (run / "metrics.csv").write_bytes(b"\x89PNG\r\n\x00\xff\n" * 9), "no column env_steps"),
         (lambda run: (run / "config.yaml").write_text("a: [b"), "config.yaml is not YAML"),
         (lambda run: (run / "config.yaml").write_text("just words"), "config.yaml holds no settings"),
@@ -400,8 +393,8 @@ def test_half_written_files_are_read_as_far_as_they_go(tmp_path, text, steps, va
 
 def test_only_wanted_columns_are_read(tmp_path):
     path = tmp_path / "metrics.csv"
-    path.write_text("env_steps,a,b\n1,x,2\n")
-    table = read_metrics(path, ["b", "c"])
+    path.write_text("env_steps,a,b,empty\n1,x,2,\n")
+    table = read_metrics(path, ["b", "c", "empty"])
     assert list(table.columns) == ["b"] and table.problems == []
 
 
@@ -419,22 +412,22 @@ def test_what_a_run_does_not_log_is_named(tmp_path):
 def test_evaluations_by_env_steps_then_those_after_training(tmp_path):
     folder = tmp_path / "evaluations"
     folder.mkdir()
-    for name in ("000000200_dream.npz", "000000100_dream.npz", "000000100_stochastic_dream.npz"):
-        (folder / name).touch()
-    assert evaluation_files(tmp_path, "_dream.npz") == [folder / f"000000{n}00_dream.npz" for n in (1, 2)]
+    for name in ("000000200", "000000100", "000000100_stochastic"):
+        (folder / f"{name}_trajectory.csv").touch()
     after = [
         tmp_path / name / "evaluations" for name in ("evaluation", "evaluation_2", "evaluation_10", "evaluation_x")
     ]
     for place in after:
         place.mkdir(parents=True)
-        (place / "deterministic_dream.npz").touch()
-        (place / "stochastic_dream.npz").touch()
-    assert evaluation_files(tmp_path, "_dream.npz")[2:] == [place / "deterministic_dream.npz" for place in after[:3]]
-    first, second = evaluation_files(tmp_path, "_dream.npz")[:2]
+        (place / "deterministic_trajectory.csv").touch()
+        (place / "stochastic_trajectory.csv").touch()
+    first, second, *others = evaluation_files(tmp_path, "_trajectory.csv")
+    assert [first, second] == [folder / f"000000{n}00_trajectory.csv" for n in (1, 2)]
+    assert others == [place / "deterministic_trajectory.csv" for place in after[:3]]
     (folder / "000000100.json").write_text('{"gates_per_episode": 2, "return_mean": 7.5}')
-    assert evaluation_score(first, "_dream.npz") == (2.0, 7.5) > evaluation_score(second, "_dream.npz")
+    assert evaluation_score(first) == (2.0, 7.5) > evaluation_score(second)
     (folder / "000000100.json").write_text('{"gates_per_episode": null, "return_mean": 7.5}')
-    assert evaluation_score(first, "_dream.npz") == evaluation_score(second, "_dream.npz")
+    assert evaluation_score(first) == evaluation_score(second)
 
 
 def test_tables_that_results_keep_are_drawn_by_their_names(tmp_path):
@@ -467,10 +460,3 @@ def test_the_columns_of_a_table_say_who_learned():
         assert run.key.algorithm == algorithm
         folder = name.partition("/")[0]
         assert run.key.variant.split()[:1] == ([] if folder == algorithm else [folder])
-
-
-def test_a_short_run_is_drawn_without_steps():
-    steps = np.arange(1.0, 21.0) * 500
-    grid = np.linspace(500, 10_000, 240)
-    np.testing.assert_allclose(resample(steps, steps, grid, window=200.0), grid)  # 2 % of the run: less than a row
-    np.testing.assert_allclose(resample(steps, steps, grid, window=1400.0)[30:-30], grid[30:-30])  # two or three rows

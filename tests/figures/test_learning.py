@@ -34,12 +34,12 @@ def test_learning_curves_have_a_panel_a_track_and_a_row_a_quantity(tmp_path, fig
                 write_run(tmp_path, f"{algorithm}_{track}_seed{seed}", track=track, seed=seed, algorithm=algorithm)
     (write_run(tmp_path, "ppo_circle_seed0", algorithm="ppo") / "metrics.csv").unlink()
     runs, problems = read_runs(find_runs([tmp_path]))
-    curves = learning_curves(runs, ["return", "success_rate"], problems=problems)
+    curves = learning_curves(runs, ["success_rate", "return"], problems=problems)
     plot_learning_curves(curves, tmp_path / "figure.png")
     *panels, below = figures[0].axes
     assert [axes.get_title() for axes in panels] == ["Circle", "Kidney", "", ""]
     assert [axes.get_ylabel() for axes in panels] == [
-        "Return\n(training episodes)", "", "Success rate\n(deterministic)", ""
+        "Success rate\n(deterministic)", "", "Return\n(training episodes)", ""
     ]  # fmt: skip
     assert all(axes.get_xlim() == (0.0, 2000.0) and len(axes.lines) == 2 for axes in panels)
     assert all(len(axes.collections) == 2 for axes in panels)  # bands
@@ -50,15 +50,6 @@ def test_learning_curves_have_a_panel_a_track_and_a_row_a_quantity(tmp_path, fig
     colors = [line.get_color() for line in legend.get_lines()]
     assert len(set(colors)) == 2
     assert {line.get_color() for line in panels[0].lines} == set(colors)
-
-
-def test_rows_stand_in_the_order_asked_for(tmp_path, figures):
-    write_run(tmp_path, "ppo_circle_seed0", algorithm="ppo")
-    runs, _ = read_runs(find_runs([tmp_path]))
-    for number, asked in enumerate((["success_rate", "return"], ["return", "success_rate"])):
-        plot_learning_curves(learning_curves(runs, asked), tmp_path / "figure.png")
-        labels = [axes.get_ylabel().partition("\n")[0] for axes in figures[number].axes[:-1]]
-        assert labels == [{"success_rate": "Success rate", "return": "Return"}[name] for name in asked]
 
 
 def curve(key: CurveKey, seeds: list[int], quantity: str = "return") -> Curve:
@@ -92,19 +83,6 @@ def test_the_legend_says_where_seeds_are_missing(tmp_path, figures):
     ]
 
 
-def ablation_keys() -> list[CurveKey]:
-    return [CurveKey("", "dreamer_v3", name) for name in compose("ablation").variants]
-
-
-def test_every_variant_of_the_ablation_has_a_style_of_its_own():
-    keys = ablation_keys()
-    assert len(keys) >= 12
-    styles = line_styles([*keys, CurveKey("", "ppo", "")])
-    looks = {(style["color"], str(style["linestyle"])) for style in styles.values()}
-    assert len(looks) == len(keys) + 1
-    assert [key.variant for key in keys if styles[key]["linewidth"] > 1.5] == ["default"]
-
-
 def test_more_than_sixteen_variants_are_refused():
     keys = [CurveKey("", "sac", f"v{index:02}") for index in range(17)]
     styles = line_styles(keys[:16])
@@ -116,11 +94,12 @@ def test_more_than_sixteen_variants_are_refused():
 
 
 def test_among_many_variants_the_default_stands_out(tmp_path, figures):
-    curves = [curve(key._replace(track="circle"), [3, 3]) for key in ablation_keys()]
+    variants = compose("ablation").variants
+    curves = [curve(CurveKey("circle", "dreamer_v3", name), [3, 3]) for name in variants]
     plot_learning_curves(LearningCurves(curves, {}, "mean", 10.0, []), tmp_path / "figure.png")
     panel = figures[0].axes[0]
-    assert len(panel.lines) == len(curves) and len(panel.collections) == 1  # one band
-    assert panel.lines[-1].get_linewidth() == max(line.get_linewidth() for line in panel.lines)  # drawn last
+    assert len(panel.lines) == len(curves) >= 12 and len(panel.collections) == 1  # one band
+    assert [line for line in panel.lines if line.get_linewidth() > 1.5] == panel.lines[-1:]  # drawn last
     assert legend_texts(figures[0])[0] == "DreamerV3, default (3 seeds)"
 
 

@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from PIL import Image
+from torchrl.record.loggers.csv import CSVLogger
 
 from dreamer_racing.figures.film import write_video
 from dreamer_racing.figures.loggers import LoggerConfig, Wandb, make_loggers, read_film
@@ -42,11 +43,12 @@ def events_of(run_dir: Path):
     return events
 
 
-def test_tensorboard_shows_configuration_plots_and_films(run_dir):
+def test_tensorboard_shows_configuration_plots_and_films(run_dir, tmp_path):
     (sink,) = make_loggers(run_dir, LoggerConfig())
     sink.log_configuration(SETTINGS, "seed: 3\ntrack: circle\n")
     with MetricsLog(run_dir, [sink]) as log:
-        log_evaluation(log.loggers, RunDirectory(run_dir), 2000)
+        other = CSVLogger(exp_name="other", log_dir=str(tmp_path))  # which need not know of films
+        log_evaluation([*log.loggers, other], RunDirectory(run_dir), 2000)
         log.push({"evaluation/return_mean": 1.0})
         log.write(2000)
     events = events_of(run_dir)
@@ -83,12 +85,6 @@ def test_a_film_keeps_its_speed(run_dir):
     assert len(frames) / fps == pytest.approx(250 / 25, rel=0.02)
     whole, fps = read_film(run_dir / "videos" / "000002000.mp4", max_frames=250, max_width=400)
     assert whole.shape == (250, 16, 400, 3) and fps == 25
-
-
-def test_other_loggers_need_not_know_of_films(run_dir, tmp_path):
-    from torchrl.record.loggers.csv import CSVLogger
-
-    log_evaluation([CSVLogger(exp_name="other", log_dir=str(tmp_path))], RunDirectory(run_dir), 2000)
 
 
 def test_a_missing_wandb_is_refused(tmp_path, monkeypatch):

@@ -230,7 +230,7 @@ def test_a_defect_costs_no_other_figure_and_is_no_secret(runs, recipe, monkeypat
     def broken(*_: object) -> None:
         raise TypeError("not a figure")
 
-    monkeypatch.setitem(recipe.FIGURES, "learning_curves", recipe.Entry(broken, recipe.no_columns))
+    monkeypatch.setitem(recipe.FIGURES, "learning_curves", recipe.Entry(broken, lambda config: ()))
     with pytest.raises(TypeError, match="not a figure"):
         recipe.draw(recipe.PlotConfig(runs=str(runs / "runs"), output=str(runs / "figures")))
     assert (runs / "figures" / "trajectories.png").exists()
