@@ -34,6 +34,7 @@ from dreamer_racing.modules import join_features
 from dreamer_racing.modules.agent import Agent
 from dreamer_racing.modules.interface import IMU, PIXELS, VECTOR
 from dreamer_racing.modules.rssm import mix_uniform
+from dreamer_racing.settings import check_choice
 from dreamer_racing.training.directory import ensure_writable
 
 PACKAGES = ("onnx", "onnxscript", "onnxruntime")
@@ -115,23 +116,17 @@ class ActorStep(nn.Module):
     def example_inputs(self) -> dict[str, Tensor]:
         """Return inputs by name, in the order of ``forward``."""
         size, interface = self.size, self.interface
-        seen = (
-            {"image_u8": torch.zeros(1, *interface.image_shape, dtype=torch.uint8)}
-            if interface.pixels
-            else {"vector": torch.zeros(1, interface.vector_dim)}
-        )
-        beside = interface.vector_key if interface.pixels and interface.vector_dim else None
-        numbers = {} if beside is None else {beside: torch.zeros(1, interface.vector_dim)}
-        noise = {} if self.noise_shape is None else {"noise": torch.full((1, *self.noise_shape), 0.5)}
-        return {
-            **seen,
+        memory = {
             "h": torch.zeros(1, size.belief),
             "z": torch.zeros(1, size.state),
             "previous_action": torch.zeros(1, interface.action_dim),
             "is_init": torch.ones(1, dtype=torch.bool),
-            **numbers,
-            **noise,
         }
+        numbers = {interface.vector_key: torch.zeros(1, interface.vector_dim)} if interface.vector_dim else {}
+        noise = {} if self.noise_shape is None else {"noise": torch.full((1, *self.noise_shape), 0.5)}
+        if not interface.pixels:
+            return numbers | memory | noise
+        return {"image_u8": torch.zeros(1, *interface.image_shape, dtype=torch.uint8)} | memory | numbers | noise
 
     def _embed(self, *seen: Tensor) -> Tensor:
         return self.encoder(dict(zip(self.interface.observation_keys, seen, strict=True)))
@@ -167,12 +162,7 @@ class SampledActorStep(ActorStep):
 
 
 class StepPart(nn.Module):
-    """One part of a step, as a module of its own for export.
-
-    Args:
-        step: The step.
-        name: A key of `PARTS`.
-    """
+    """One of the `PARTS` of a step, as a module of its own for export."""
 
     def __init__(self, step: ActorStep, name: str) -> None:
         super().__init__()
@@ -196,13 +186,12 @@ LATENTS: dict[str, type[ActorStep]] = {step.latent: step for step in (ActorStep,
 
 
 def make_step(agent: Agent, latent: str) -> ActorStep:
-    """Make the step of an agent with a latent mode.
+    """Make the step of an agent with a latent mode, one of `LATENTS`.
 
     Raises:
         ValueError: Unknown latent mode, or an agent that cannot be exported.
     """
-    if latent not in LATENTS:
-        raise ValueError(f"latent={latent}: must be {' or '.join(LATENTS)}.")
+    check_choice("latent", latent, LATENTS)
     if latent == "sample" and not agent.world_model.rssm.sampled:
         raise ValueError(
             "latent=sample: this agent uses the probabilities of its categorical latents and never samples them "
@@ -318,7 +307,13 @@ def export_actor(
         if parts:
             actors["onnxruntime in parts"] = OnnxActor(onnx)
         deviation = check_parity(actors, flight, seed)
-        full["verification"] = _verification(flight, deviation)
+        full["verification"] = {
+            "steps": len(flight.observations),
+            "episodes": flight.episodes,
+            "action_deviation_max": deviation,
+            "action_deviation_allowed": ACTION_TOLERANCE,
+            "latent_flips": 0,
+        }
         _write_json(partial / CONTRACT, full)
         for path in (*written.values(), partial / CONTRACT):
             os.replace(path, output.parent / path.name)
@@ -327,17 +322,6 @@ def export_actor(
     finally:
         shutil.rmtree(partial, ignore_errors=True)
     return deviation
-
-
-def _verification(flight: RecordedFlight, deviation: dict[str, float]) -> dict[str, Any]:
-    """Return the contract's description of a passed comparison."""
-    return {
-        "steps": len(flight.observations),
-        "episodes": flight.episodes,
-        "action_deviation_max": deviation,
-        "action_deviation_allowed": ACTION_TOLERANCE,
-        "latent_flips": 0,
-    }
 
 
 def write_step(step: ActorStep, onnx: Path, program: Path) -> None:

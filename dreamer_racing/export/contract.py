@@ -47,10 +47,7 @@ def make_contract(
         "project_version": version("dreamer_racing"),
         "source": source,
         "weights_sha256": hash_weights(step),
-        "model": {
-            **asdict(size),
-            "parameters": sum(parameter.numel() for parameter in step.parameters()),
-        },
+        "model": {**asdict(size), "parameters": sum(parameter.numel() for parameter in step.parameters())},
         "latent": step.latent,
         "inputs": _describe(step.example_inputs(), size.sampled),
         "outputs": _describe(outputs, size.sampled),

@@ -197,18 +197,14 @@ class OnnxActor(RecurrentActor):
         self._first_h: np.ndarray | None = None  # h_next of an episode's first step, which is always the same
         super().__init__(read_contract(path.parent / CONTRACT), seed)
         self._check_files(path)
-        described = self.contract["files"]
-        files = {part: described.get(part) for part in PARTS}
-        self.in_parts = None not in files.values() and not whole
-        if self.in_parts:
-            self._sessions = {part: _open_session(path.parent / file["name"], threads) for part, file in files.items()}
-            self._check_parts(path)
-            self._first_h = self._advance()
-            self.reset()
-        else:
-            self._sessions = {"step": _open_session(path, threads)}
-            self._check_session(path)
+        parts = {part: self.contract["files"].get(part) for part in PARTS}
+        self.in_parts = None not in parts.values() and not whole
+        files = {part: path.parent / file["name"] for part, file in parts.items()} if self.in_parts else {"step": path}
         self._outputs = [entry["name"] for entry in self.contract["outputs"]]
+        self._sessions = {part: _open_session(file, threads) for part, file in files.items()}
+        self._check_sessions(files)
+        if self.in_parts:
+            self._first_h = self._advance()
 
     def reset(self) -> None:
         """Begin an episode: the next step ignores the state before it."""
@@ -236,26 +232,19 @@ class OnnxActor(RecurrentActor):
                     "written there. Copy both from the same export."
                 )
 
-    def _check_session(self, path: Path) -> None:
-        """Check that the ONNX file has the contract's inputs and outputs."""
-        session = self._sessions["step"]
-        for kind, arguments in (("inputs", session.get_inputs()), ("outputs", session.get_outputs())):
-            there = [(argument.name, list(argument.shape)) for argument in arguments]
-            promised = [(entry["name"], entry["shape"]) for entry in self.contract[kind]]
-            if there != promised:
-                raise ValueError(f"{path} has the {kind} {there}, but its contract promises {promised}.")
-
-    def _check_parts(self, path: Path) -> None:
-        """Check that the parts have the inputs and outputs of the contract's step."""
+    def _check_sessions(self, files: dict[str, Path]) -> None:
+        """Check that the ONNX files have the inputs and outputs of the contract's step, or of its parts."""
         shapes = {entry["name"]: entry["shape"] for kind in ("inputs", "outputs") for entry in self.contract[kind]}
         before = [*RECURRENT, "is_init"]
-        inputs = {"advance": before, "act": ["h_next", *(name for name in self._shapes if name not in before)]}
+        seen = [name for name in self._shapes if name not in before]
+        names = {"step": [*shapes], "advance": [*before, *PARTS["advance"]], "act": [*seen, "h_next", *PARTS["act"]]}
         for part, session in self._sessions.items():
             there = {each.name: list(each.shape) for each in (*session.get_inputs(), *session.get_outputs())}
-            promised = {name: shapes.get(name) for name in (*inputs[part], *PARTS[part])}
+            promised = {name: shapes.get(name) for name in names[part]}
             if there != promised:
-                file = path.parent / self.contract["files"][part]["name"]
-                raise ValueError(f"{file} has the inputs and outputs {there}, but its contract promises {promised}.")
+                raise ValueError(
+                    f"{files[part]} has the inputs and outputs {there}, but its contract promises {promised}."
+                )
 
     def _advance(self) -> np.ndarray:
         feed = {**self.state, "is_init": np.array([self.is_init])}

@@ -60,12 +60,9 @@ class RecordedFlight:
 
 @torch.no_grad()
 def record_flight(env: DroneRacingEnv, agent: Agent, steps: int) -> RecordedFlight:
-    """Record a flight of the deterministic policy in an environment with one drone.
+    """Record T steps of the deterministic policy in an environment with one drone.
 
-    Args:
-        env: Environment with ``num_envs=1``, and with ``episode_steps`` from `episode_steps`, so that there are resets.
-        agent: The agent with the policy.
-        steps: T.
+    For resets, the environment has episodes of `episode_steps`.
 
     Raises:
         ValueError: The environment has several drones.
@@ -96,28 +93,16 @@ def episode_steps(steps: int) -> int:
 
 
 def check_steps(steps: int) -> None:
-    """Check that a flight is long enough for a comparison.
-
-    Raises:
-        ValueError: Fewer than ``MIN_STEPS`` steps.
-    """
+    """Raise ValueError if a flight is too short for a comparison."""
     if steps < MIN_STEPS:
         raise ValueError(f"steps={steps}: an export must be compared over at least {MIN_STEPS} steps.")
 
 
 class TorchActor(RecurrentActor):
-    """A `RecurrentActor` that runs a step in torch.
+    """A `RecurrentActor` that runs an `ActorStep`, or the module of its ``torch.export`` program, in torch."""
 
-    Args:
-        contract: Contract of the step.
-        step: An `ActorStep`, or the module of its ``torch.export`` program.
-        seed: Seed of the noise that samples latents.
-    """
-
-    def __init__(
-        self, contract: dict[str, Any], step: Callable[..., Sequence[Tensor]], seed: int | None = None
-    ) -> None:
-        super().__init__(contract, seed)
+    def __init__(self, contract: dict[str, Any], step: Callable[..., Sequence[Tensor]]) -> None:
+        super().__init__(contract)
         self._step = step
 
     @torch.no_grad()
@@ -128,12 +113,8 @@ class TorchActor(RecurrentActor):
 def check_parity(actors: Mapping[str, RecurrentActor], flight: RecordedFlight, seed: int = 0) -> dict[str, float]:
     """Replay a recorded flight with each actor, and compare them with the first.
 
-    If latents are not sampled, the first actor is also compared with the recorded actions.
-
-    Args:
-        actors: Actors by name; the first is the original.
-        flight: The recorded flight.
-        seed: Seed of the noise that samples latents, the same for all.
+    If latents are not sampled, the first actor, the original, is also compared with the recorded actions. Else all get
+    the same noise, of the seed.
 
     Returns:
         Largest deviation of an action of each actor but the first, by name.

@@ -36,7 +36,6 @@ AVERAGED, TRAINED = "averaged", "trained"
 CHOICES = ("auto", AVERAGED, TRAINED)
 """Choices of a checkpoint's weights: ``auto`` takes the averaged ones if the checkpoint has them."""
 
-_UNUSED_MODULES = ("critic", "world_model.reward_head", "world_model.continue_head")
 _SETTINGS = {
     "camera.width_px": "env.image_size",
     "camera.height_px": "env.image_size",
@@ -47,12 +46,7 @@ _SETTINGS = {
 
 
 def choose_weights(wanted: str, kept: str | tuple[str, ...], source: str | Path) -> str:
-    """Resolve a choice of weights to ``averaged`` or ``trained``.
-
-    Args:
-        wanted: One of ``CHOICES``.
-        kept: The weights in the source.
-        source: Checkpoint or agent folder, for the message.
+    """Resolve one of ``CHOICES`` to ``averaged`` or ``trained``, of the weights kept in a checkpoint or agent folder.
 
     Raises:
         ValueError: If the choice is unknown, or the source does not hold these weights.
@@ -105,28 +99,18 @@ def load_agent(checkpoint: str | Path, interface: Interface, weights: str = "aut
 
 @dataclass
 class ShippedAgent:
-    """An agent loaded from an agent folder.
-
-    Attributes:
-        folder: The agent folder.
-        agent: Encoder, RSSM and actor, without critic and heads.
-        about: Content of agent.json.
-        device: Device of the networks.
-    """
+    """An agent loaded from an agent folder."""
 
     folder: Path
     agent: Agent
+    """Encoder, RSSM and actor, without critic and heads."""
     about: dict[str, Any]
+    """Content of agent.json."""
     device: torch.device
 
     @classmethod
     def load(cls, folder: str | Path, env: DroneRacingEnv, device: torch.device | str = "cpu") -> ShippedAgent:
-        """Restore an agent for an environment.
-
-        Args:
-            folder: The agent folder.
-            env: An environment with the camera and the control rate of the agent's training.
-            device: Device of the networks.
+        """Restore an agent for an environment with the camera and the control rate of its training.
 
         Raises:
             FileNotFoundError: If the folder lacks a file.
@@ -137,9 +121,12 @@ class ShippedAgent:
         _require_files(folder, *(file["name"] for part in PARTS if (file := contract["files"].get(part))))
         check_env(folder, contract, env)
         agent = Agent(_size(contract["model"]), Interface.of(env), decode=False)
-        for name in _UNUSED_MODULES:
-            parent, _, child = name.rpartition(".")
-            agent.get_submodule(parent).register_module(child, None)
+        for module, unused in (
+            (agent, "critic"),
+            (agent.world_model, "reward_head"),
+            (agent.world_model, "continue_head"),
+        ):
+            module.register_module(unused, None)
         load_networks(folder, agent)
         # Hash the file, not the network: newer networks may have entries that the file lacks.
         if hash_tensors(read_weights(folder / WEIGHTS)) != contract["weights_sha256"]:
@@ -193,13 +180,9 @@ def is_agent(folder: str | Path) -> bool:
 
 
 def find_trained(name: str) -> Path:
-    """Find the agent or checkpoint that `checkpoint=` or `agent=` names.
+    """Return the folder of the agent, or the newest checkpoint, that `checkpoint=` or `agent=` names.
 
-    Args:
-        name: of an included agent; or path of an agent's folder, a run directory, or a checkpoint.
-
-    Returns:
-        The folder of the agent, or the newest checkpoint there.
+    The name is that of an included agent, or the path of an agent's folder, a run directory, or a checkpoint.
 
     Raises:
         FileNotFoundError: there is neither; the message names the included agents.
@@ -246,11 +229,6 @@ def _require_files(folder: Path, *names: str) -> None:
 def check_env(folder: str | Path, contract: dict[str, Any], env: DroneRacingEnv) -> None:
     """Check that an environment has the observations and the control rate of an agent's training.
 
-    Args:
-        folder: The agent folder, for the message.
-        contract: Contract of the actor.
-        env: The environment.
-
     Raises:
         ValueError: The message names the setting, the agent's value and the environment's.
     """
@@ -292,13 +270,7 @@ def read_evaluation(
 ) -> dict[str, Any]:
     """Return the statistics of an evaluation of these weights on the track that they were trained on, for agent.json.
 
-    Args:
-        path: evaluation.json.
-        checkpoint: Checkpoint of the agent, for messages.
-        weights_sha256: Hash of the weights.
-        track: Track that the agent was trained on, for messages.
-        track_sha256: Hash of that track.
-        how: A sentence that says how to make the evaluation, for messages.
+    Messages end with ``how``, a sentence that says how to make the evaluation.
 
     Raises:
         FileNotFoundError: There is none.

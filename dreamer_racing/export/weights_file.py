@@ -31,14 +31,7 @@ class Extent(NamedTuple):
 
 
 def write_weights(path: str | Path, weights: Mapping[str, Tensor]) -> dict[str, Extent]:
-    """Write float32 tensors, sorted by name.
-
-    Args:
-        path: The file.
-        weights: Tensors of any shape, by name.
-
-    Returns:
-        The extent of each tensor.
+    """Write float32 tensors, sorted by name; return the extent of each.
 
     Raises:
         ValueError: If a tensor is not float32.

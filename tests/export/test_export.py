@@ -13,7 +13,6 @@ import zipfile
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
 import pytest
@@ -22,7 +21,6 @@ from omegaconf import OmegaConf
 
 from dreamer_racing.envs.drone.parameters import PRESETS
 from dreamer_racing.envs.simulator.scene import Camera
-from dreamer_racing.envs.torchrl_env import DroneRacingEnv
 from dreamer_racing.export import actor_step as export
 from dreamer_racing.export import onnx_actor
 from dreamer_racing.export.actor_step import (
@@ -40,8 +38,6 @@ from dreamer_racing.export.parity import (
     RecordedFlight,
     TorchActor,
     check_parity,
-    episode_steps,
-    record_flight,
 )
 from dreamer_racing.export.shipped_agent import load_agent
 from dreamer_racing.modules import Interface, ModelSize, get_size
@@ -122,25 +118,9 @@ def exported(request: pytest.FixtureRequest, exports: Callable[[str], Path]) -> 
 # --- the step ---------------------------------------------------------------------------------------------------------
 
 
-def test_the_step_flies_as_the_policy_did(agent: Agent) -> None:
-    env = DroneRacingEnv("circle", 1, seed=0, episode_steps=episode_steps(MIN_STEPS), num_threads=1)
-    flight = record_flight(env, agent, MIN_STEPS)
-    env.close()
-    assert flight.observations.shape == (MIN_STEPS, 64, 64, 3) and flight.observations.dtype == np.uint8
-    assert flight.is_init[0] and flight.episodes >= 4
-    assert flight.observations.std(axis=0).max() > 0, "the drone saw the same image all the time"
-    step = ActorStep(agent)
-    actor = TorchActor(contract_of(step), step)
-    for index, observation in enumerate(flight.observations):
-        if flight.is_init[index]:
-            actor.reset()
-        np.testing.assert_allclose(actor.step(observation), flight.actions[index], atol=1e-6)
-
-
-@pytest.mark.parametrize("step_class", [ActorStep, SampledActorStep])
 @pytest.mark.parametrize("size", ["debug", LEARNED, STATE_SPACE], ids=["zero", "learned", "state space"])
-def test_a_reset_forgets_everything(size: ModelSize | str, step_class: type[ActorStep]) -> None:
-    step = step_class(make_agent(size))
+def test_a_reset_forgets_everything(size: ModelSize | str) -> None:
+    step = ActorStep(make_agent(size))
     inputs = step.example_inputs()
     garbage = {name: torch.full_like(inputs[name], math.nan) for name in ("h", "z", "previous_action")}
     for clean, dirty in zip(step(*inputs.values()), step(*(inputs | garbage).values()), strict=True):
@@ -231,14 +211,8 @@ def test_an_export_of_another_kind_leaves_nothing_of_an_earlier_one(
     assert {path.name for path in tmp_path.iterdir()} == {"actor.onnx", "contract.json", "weights.safetensors"}
 
 
-class InParts(NamedTuple):
-    """An export of a step in two parts."""
-
-    output: Path
-    flight: RecordedFlight
-    deviation: dict[str, float]
-
-
+InParts = tuple[Path, RecordedFlight, dict[str, float]]
+"""The .onnx file of a step in two parts, the flight on which it was compared, and its deviation."""
 IN_PARTS = {"gru": (LEARNED, "sample", False), "state space": (STATE_SPACE, "mode", True)}
 """Size, latent mode and whether the files share weights."""
 
@@ -254,7 +228,7 @@ def in_parts(tmp_path_factory: pytest.TempPathFactory) -> Callable[[str], InPart
         step, flight = make_step(agent, latent), make_flight(agent)
         contract = contract_of(step)
         deviation = export_actor(step, contract, flight, output, shared_weights=shared_weights, parts=True)
-        return InParts(output, flight, deviation)
+        return output, flight, deviation
 
     return export_once
 
@@ -288,7 +262,7 @@ def test_parts_of_another_export_are_refused(
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    shutil.copytree(in_parts("state space").output.parent, tmp_path, dirs_exist_ok=True)  # with shared weights
+    shutil.copytree(in_parts("state space")[0].parent, tmp_path, dirs_exist_ok=True)  # with shared weights
     output = tmp_path / "actor.onnx"
     contract = json.loads((tmp_path / "contract.json").read_text())
     files = contract["files"]
@@ -339,13 +313,6 @@ def test_reset_begins_again_and_a_seed_repeats(exported: Path) -> None:
     same_seed = onnx_actor.OnnxActor(exported, seed=5)
     np.testing.assert_array_equal(first, [same_seed.step(image) for image in images])
     assert np.array_equal(first, second) == (actor.noise_shape is None), "only noise may tell the episodes apart"
-
-
-def test_the_program_flies_as_torch_does(exported: Path, agent: Agent) -> None:
-    contract = onnx_actor.read_contract(exported.parent / "contract.json")
-    step, program = make_step(agent, contract["latent"]), torch.export.load(exported.with_suffix(".pt2"))
-    actors = {"torch": TorchActor(contract, step), "program": TorchActor(contract, program.module())}
-    assert check_parity(actors, make_flight(agent), seed=3)["program"] < 1e-5
 
 
 def test_the_files_hold_no_paths_of_this_machine(exported: Path) -> None:
@@ -414,14 +381,7 @@ def check_disturbed(agent: Agent, change: Callable[[list[np.ndarray]], None]) ->
 
 
 def add_to_action(value: float) -> Callable[[list[np.ndarray]], None]:
-    def change(outputs: list[np.ndarray]) -> None:
-        outputs[0][0, 1] += value
-
-    return change
-
-
-def next_class(outputs: list[np.ndarray]) -> None:
-    outputs[2] = np.roll(outputs[2].reshape(4, 4), 1, axis=1).reshape(1, 16)
+    return lambda outputs: np.add.at(outputs[0], (0, 1), value)
 
 
 def test_the_tolerance_of_actions(agent: Agent) -> None:
@@ -432,6 +392,9 @@ def test_the_tolerance_of_actions(agent: Agent) -> None:
 
 
 def test_a_flipped_latent_is_refused_even_if_no_action_shows_it(agent: Agent) -> None:
+    def next_class(outputs: list[np.ndarray]) -> None:
+        outputs[2] = np.roll(outputs[2].reshape(4, 4), 1, axis=1).reshape(1, 16)
+
     with pytest.raises(ParityError, match=r"step 199 of 200.*by 0.00e\+00.*latent 0 by 1.00e\+00 \(allowed: 1e-03\)"):
         check_disturbed(agent, next_class)
 
@@ -463,6 +426,14 @@ def test_the_contract_says_what_a_pilot_must_know(exported: Path, agent: Agent) 
     assert contract["files"]["onnx"]["sha256"] == onnx_actor.hash_file(exported)
     verification = contract["verification"]
     assert verification["steps"] == 200 and verification["episodes"] == 6 and verification["latent_flips"] == 0
+
+
+def test_the_contract_of_an_agent_that_sees_numbers_lists_them() -> None:
+    contract = contract_of(ActorStep(make_agent(interface=Interface(pixels=False, vector_dim=21))))
+    assert contract["camera"] is None
+    channels = contract["vector"]["channels"]
+    assert len(channels) == 21
+    assert channels[4] == {"name": "body rates of the drone, y", "unit": "rad/s", "divisor": 5.0}
 
 
 def test_actions_get_their_units(exported: Path) -> None:
@@ -549,33 +520,24 @@ def test_a_wrong_image_is_refused_and_changes_nothing(exported: Path, observatio
     np.testing.assert_array_equal(actor.state["h"], before)
 
 
-def test_noise_is_checked_too(exported: Path) -> None:
-    actor = onnx_actor.OnnxActor(exported)
+def test_noise_and_numbers_are_checked_too(exported: Path) -> None:
     with pytest.raises(ValueError, match="noise"):
-        actor.step(np.zeros((64, 64, 3), np.uint8), np.zeros((3, 3), np.float32))
-
-
-def test_numbers_that_are_not_finite_are_refused() -> None:
+        onnx_actor.OnnxActor(exported).step(np.zeros((64, 64, 3), np.uint8), np.zeros((3, 3), np.float32))
     step = ActorStep(make_agent(interface=Interface(pixels=False, vector_dim=21)))
-    actor = TorchActor(contract_of(step), step)
     with pytest.raises(ValueError, match="vector: .* not finite"):
-        actor.step(np.full(21, np.nan, np.float32))
+        TorchActor(contract_of(step), step).step(np.full(21, np.nan, np.float32))
 
 
-def spoil(key: str, value: object):
-    def write(contract: Path) -> None:
-        contract.write_text(json.dumps(json.loads(contract.read_text()) | {key: value}))
-
-    return write
-
-
-def spoil_input(number: int, key: str, value: object):
+def spoil(key: str, value: object, of_first_input: bool = False) -> Callable[[Path], None]:
     def write(path: Path) -> None:
         contract = json.loads(path.read_text())
-        contract["inputs"][number][key] = value
+        (contract["inputs"][0] if of_first_input else contract)[key] = value
         path.write_text(json.dumps(contract))
 
     return write
+
+
+CHANNEL = {"name": "x", "unit": "m", "offset": 0}
 
 
 @pytest.mark.parametrize(
@@ -588,22 +550,14 @@ def spoil_input(number: int, key: str, value: object):
         (spoil("files", {"onnx": {"name": "actor.onnx", "sha256": "0"}}), ValueError, "SHA-256"),
         (spoil("outputs", [{"name": "thrust", "shape": [1, 4], "type": "f"}]), ValueError, "promises .*thrust"),
         (spoil("files", {"onnx": 3}), ValueError, "files.onnx is 3, not an object"),
-        (
-            spoil("action", {"channels": [{"name": "x", "unit": "m", "offset": 0}]}),
-            ValueError,
-            "channels.0. lacks scale",
-        ),
+        (spoil("action", {"channels": [CHANNEL]}), ValueError, "channels.0. lacks scale"),
         (spoil("control", {"rate_hz": float("nan")}), ValueError, "rate_hz is nan, not a number"),
         (spoil("control", {"rate_hz": -25}), ValueError, "rate_hz is -25, not above 0"),
         (spoil("control", None), ValueError, "control is None, not an object"),
         (spoil("inputs", [{"name": "h", "shape": [1], "type": "float32"}]), ValueError, "inputs lacks z, previous"),
-        (spoil_input(0, "shape", [2**40]), ValueError, "has the shape .1099511627776"),
-        (spoil_input(0, "type", "object"), ValueError, "is of type 'object', not uint8"),
-        (
-            spoil("action", {"channels": [{"name": "x", "unit": "m", "offset": 0, "scale": 1}]}),
-            ValueError,
-            "1 entries, but",
-        ),
+        (spoil("shape", [2**40], of_first_input=True), ValueError, "has the shape .1099511627776"),
+        (spoil("type", "object", of_first_input=True), ValueError, "is of type 'object', not uint8"),
+        (spoil("action", {"channels": [CHANNEL | {"scale": 1}]}), ValueError, "1 entries, but"),
         (spoil("camera", 0), ValueError, "camera is 0, not an object"),
         (spoil("weights_sha256", None), ValueError, "weights_sha256 is None, not a string"),
         (lambda path: path.write_text("[" * 100_000), ValueError, "not valid JSON"),
@@ -617,12 +571,9 @@ def test_a_contract_of_another_file_is_refused(exported: Path, tmp_path: Path, c
         onnx_actor.OnnxActor(tmp_path / "actor.onnx")
 
 
-def test_a_missing_actor_is_named(tmp_path: Path) -> None:
+def test_a_missing_actor_or_runtime_is_named(exported: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     with pytest.raises(FileNotFoundError, match="nothing.onnx"):
-        onnx_actor.OnnxActor(tmp_path / "nothing.onnx")
-
-
-def test_a_missing_runtime_is_named(exported: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+        onnx_actor.OnnxActor(exported.with_name("nothing.onnx"))
     monkeypatch.setitem(sys.modules, "onnxruntime", None)
     with pytest.raises(ImportError, match="pip install onnxruntime"):
         onnx_actor.OnnxActor(exported)
@@ -632,9 +583,9 @@ def test_a_missing_runtime_is_named(exported: Path, monkeypatch: pytest.MonkeyPa
 
 
 def test_bad_arguments_are_refused(agent: Agent, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    with pytest.raises(ValueError, match="latent=median: must be mode or sample"):
+    with pytest.raises(ValueError, match="latent=median: must be one of mode, sample"):
         make_step(agent, "median")
-    with pytest.raises(ValueError, match="pixels and vector"):
+    with pytest.raises(ValueError, match="observes pixels and vector; besides images, only an IMU"):
         make_step(make_agent(interface=Interface(vector_dim=21)), "mode")
     with pytest.raises(ValueError, match="a custom vector of 5 numbers; only the race's 21 numbers"):
         make_step(make_agent(interface=Interface(pixels=False, vector_dim=5)), "mode")
@@ -727,12 +678,11 @@ def test_the_recipe_refuses_a_copy_that_flies_differently(run_dir: Path) -> None
 @pytest.mark.parametrize(
     ("settings", "words"),
     [
-        ({"latent": "median"}, ["latent=median", "mode", "sample"]),
         ({"checkpoint": "/nowhere"}, ["/nowhere", "does not exist"]),
         ({"output": "/dev/null/x/actor.onnx"}, ["/dev/null/x", "cannot write"]),
         ({"steps": 10}, ["steps=10", "200"]),
     ],
-    ids=lambda value: next(iter(value)) if isinstance(value, dict) else None,
+    ids=["checkpoint", "output", "steps"],
 )
 def test_bad_input_gets_a_plain_error(
     run_dir: Path, settings: dict, words: list[str], capsys: pytest.CaptureFixture[str]
@@ -743,12 +693,3 @@ def test_bad_input_gets_a_plain_error(
     said = capsys.readouterr().err
     assert refused.value.code == 2 and all(word in said for word in words), said
     assert len(said.strip().splitlines()) <= 6
-
-
-def test_the_contract_of_an_agent_that_sees_numbers_lists_them() -> None:
-    step = ActorStep(make_agent(interface=Interface(pixels=False, vector_dim=21)))
-    contract = make_contract(step, PRESETS["easy"], Camera())
-    assert contract["camera"] is None
-    channels = contract["vector"]["channels"]
-    assert len(channels) == 21
-    assert channels[4] == {"name": "body rates of the drone, y", "unit": "rad/s", "divisor": 5.0}
