@@ -150,5 +150,6 @@ def record_dream(learner: WorldModelLearner, trajectory: Trajectory, painter: Pa
     reconstructed = dream(learner, trajectory, painter, part)
     imagined = dream(learner, trajectory, painter, part, seen)
     imagined[:seen] = reconstructed[:seen]  # the same sample of the latents in both
-    stored = (images[None, ::STRIDE].numpy() for images in (pixels[part], reconstructed, imagined))
-    return Dream(*stored, SEEN_FRAMES, STRIDE * trajectory.control_dt, isinstance(painter, BelievedView))
+    frame_dt, from_pose = STRIDE * trajectory.control_dt, isinstance(painter, BelievedView)
+    stored = [images[None, ::STRIDE].numpy() for images in (pixels[part], reconstructed, imagined)]
+    return Dream(*stored, context=SEEN_FRAMES, frame_dt=frame_dt, from_pose=from_pose)

@@ -274,7 +274,10 @@ def _deviation_band(strata: Sequence[np.ndarray]) -> np.ndarray:
     return pooled.mean(0) + np.array([[-1.0], [1.0]]) * pooled.std(0, ddof=1)
 
 
-AGGREGATES = {"mean": (partial(np.mean, axis=0), _deviation_band), "iqm": (interquartile_mean, bootstrap_interval)}
+AGGREGATES: dict[str, tuple[Callable[..., np.ndarray], Callable[..., np.ndarray]]] = {
+    "mean": (partial(np.mean, axis=0), _deviation_band),
+    "iqm": (interquartile_mean, bootstrap_interval),
+}
 """Functions for the centre, from runs (S, P), and for the band (2, P), from runs by track."""
 
 

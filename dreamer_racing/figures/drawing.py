@@ -186,9 +186,9 @@ def _draw_cameras(axes: Axes, trajectory: Trajectory, plane: tuple[int, int]) ->
     every = max(1, round(ARROW_INTERVAL / trajectory.control_dt))
     origin = trajectory.position[::every, list(plane)].numpy()  # (M, 2)
     direction = camera_directions(trajectory.attitude[::every], tilt_of(trajectory))[:, list(plane)].numpy()
-    arrow = {"width": 0.010, "headwidth": 4.5, "headlength": 5.0, "headaxislength": 4.5, "color": INK, "alpha": 0.7}
+    arrow: Style = {"width": 0.010, "headwidth": 4.5, "headlength": 5.0, "headaxislength": 4.5, "color": INK}
     scale: Style = {"angles": "xy", "scale_units": "xy", "scale": 1.0, "units": "inches"}
-    axes.quiver(*origin.T, *(ARROW_LENGTH * direction).T, **scale, **arrow, zorder=6)
+    axes.quiver(*origin.T, *(ARROW_LENGTH * direction).T, **scale, **arrow, alpha=0.7, zorder=6)
 
 
 def _draw_ends(axes: Axes, trajectory: Trajectory, plane: tuple[int, int]) -> None:

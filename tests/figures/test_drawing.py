@@ -127,6 +127,7 @@ def test_lost_state_can_be_drawn(tmp_path):
     trajectory.position[-1] = math.nan
     trajectory.linear_velocity[-1] = math.nan
     plot_top_down(track, trajectory, tmp_path / "plot.png")
+    assert len(top_down_frames(track, trajectory, size=64)) == 61
 
 
 # Maps of tracks side by side.

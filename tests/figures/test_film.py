@@ -156,12 +156,6 @@ def test_moving_map_follows_the_drone(monkeypatch):
     assert np.abs(np.array([row for row, _ in dark]) - 64).max() < 2
 
 
-def test_lost_state_can_be_drawn():
-    trajectory = flight()
-    trajectory.position[-1] = float("nan")
-    assert len(top_down_frames(load_track("circle"), trajectory, size=64)) == 11
-
-
 def test_onboard_beside_map():
     track = load_track("circle")
     frames = onboard_beside_map(track, flight(), size=60)  # grows to the next multiple of the images'
