@@ -21,7 +21,6 @@ from dreamer_racing.modules.heads import (
     symlog,
 )
 from dreamer_racing.modules.interface import Interface
-from dreamer_racing.modules.parallel_rssm import DiagonalSSM, ParallelRSSM
 from dreamer_racing.modules.recurrent_cells import BlockGRUCell, DenseGRUCell
 from dreamer_racing.modules.rssm import RSSM, Posterior, join_features
 from dreamer_racing.modules.sizes import SIZES, ModelSize, get_size
@@ -38,14 +37,12 @@ __all__ = [
     "ContinueHead",
     "Critic",
     "DenseGRUCell",
-    "DiagonalSSM",
     "DreamerPolicy",
     "ImageDecoder",
     "ImageEncoder",
     "Interface",
     "ModelSize",
     "ObservationEncoder",
-    "ParallelRSSM",
     "Posterior",
     "TwoHot",
     "TwoHotHead",

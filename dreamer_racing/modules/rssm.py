@@ -149,7 +149,7 @@ class RSSM(nn.Module):
         latents: L.
         classes: K.
         hidden: U.
-        recurrence: Key of ``cells``; by default the first.
+        recurrence: Key of ``cells``.
         blocks: Blocks of the block GRU.
         prior_layers: Hidden layers from h to the prior's logits.
         norm: ``"rms"`` or ``"layer"``.
@@ -173,8 +173,6 @@ class RSSM(nn.Module):
 
     cells: ClassVar[dict[str, Any]] = {"block": BlockGRUCell, "dense": DenseGRUCell}
     """Recurrent cells by ``ModelSize.recurrence``."""
-    posterior_layer: ClassVar[Any] = SplitNormedLinear
-    """Class of the posterior's hidden layer, on belief and embedding."""
 
     def __init__(
         self,
@@ -184,7 +182,7 @@ class RSSM(nn.Module):
         latents: int,
         classes: int,
         hidden: int,
-        recurrence: str | None = None,
+        recurrence: str = "block",
         blocks: int = 8,
         prior_layers: int = 2,
         norm: str = "rms",
@@ -193,8 +191,7 @@ class RSSM(nn.Module):
         sampled: bool = True,
     ) -> None:
         super().__init__()
-        recurrence = recurrence or next(iter(self.cells))
-        check_choice(f"{type(self).__name__}: recurrence", recurrence, self.cells)
+        check_choice("RSSM: recurrence", recurrence, self.cells)
         self.latents, self.classes, self.unimix, self.sampled = latents, classes, unimix, sampled
         self.few_kernels = False
         self.uniform = nn.Buffer(torch.tensor(1.0 / classes), persistent=False)
@@ -205,7 +202,7 @@ class RSSM(nn.Module):
             *(NormedLinear(before, after, norm) for before, after in pairwise(widths)),
             linear(hidden, state),
         )
-        self.posterior_hidden = self.posterior_layer(belief, embedding, hidden, norm)
+        self.posterior_hidden = SplitNormedLinear(belief, embedding, hidden, norm)
         self.posterior_output = linear(hidden, state)
         self.learned_initial = learned_initial
         self.initial_belief = nn.Parameter(torch.zeros(1, belief), requires_grad=learned_initial)

@@ -18,9 +18,7 @@ class ModelSize:
         latents: Number of categorical latents in z.
         classes: Classes of each categorical latent.
         units: Width of the reward, continue, actor and critic layers.
-        recurrence: ``"block"`` (2025 block GRU), ``"dense"`` (2023 GRU) or ``"ssm"`` (an extension: a diagonal
-            state-space model, computed over a training window by a parallel scan; its posterior depends on the
-            observation alone).
+        recurrence: ``"block"`` (2025 block GRU) or ``"dense"`` (2023 GRU).
         blocks: Diagonal blocks of the block GRU and of the decoder's first layer (1: dense decoder input).
         prior_layers: Hidden layers from h to the prior's logits.
         head_layers: Hidden layers of the reward and continue heads.
@@ -150,12 +148,7 @@ SIZES: dict[str, ModelSize] = {
 """Sizes by name.
 
 Reference: ``size*`` are from danijar/dreamerv3 ``configs.yaml``; ``paper_*`` are S, M and L of Hafner et al. 2023,
-Appendix B, of which Dream to Fly uses L; ``ssm_*`` have a state-space model in place of the GRU."""
-
-SIZES |= {
-    f"ssm_{name}": replace(SIZES[name], name=f"ssm_{name}", recurrence="ssm")
-    for name in ("debug", "cpu_small", "size12m", "paper_large")
-}
+Appendix B, of which Dream to Fly uses L."""
 
 
 def get_size(size: ModelSize | str) -> ModelSize:

@@ -13,13 +13,9 @@ from torch import Tensor, nn
 from dreamer_racing.modules.autoencoder import ImageDecoder, ObservationEncoder, VectorDecoder
 from dreamer_racing.modules.heads import ContinueHead, TwoHotHead
 from dreamer_racing.modules.interface import Interface
-from dreamer_racing.modules.parallel_rssm import ParallelRSSM
 from dreamer_racing.modules.rssm import RSSM, Posterior
 from dreamer_racing.modules.sizes import ModelSize, get_size
 from dreamer_racing.settings import check_choice
-
-RSSMS: dict[str, type[RSSM]] = {recurrence: kind for kind in (RSSM, ParallelRSSM) for recurrence in kind.cells}
-"""RSSM classes by ``ModelSize.recurrence``."""
 
 
 class WorldModel(nn.Module):
@@ -51,8 +47,8 @@ class WorldModel(nn.Module):
         size, interface = get_size(size), interface or Interface()
         self.size, self.interface = size, interface
         self.encoder = ObservationEncoder(size, interface)
-        check_choice(f"model size {size.name}: recurrence", size.recurrence, RSSMS)
-        self.rssm = RSSMS[size.recurrence](
+        check_choice(f"model size {size.name}: recurrence", size.recurrence, RSSM.cells)
+        self.rssm = RSSM(
             self.encoder.embedding_size,
             interface.action_dim,
             size.belief,

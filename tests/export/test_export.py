@@ -11,7 +11,6 @@ import subprocess
 import sys
 import zipfile
 from collections.abc import Callable
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -56,8 +55,6 @@ REFERENCE = ModelSize("tiny", belief=16, hidden=8, classes=4, units=8, cnn_depth
 LEARNED = ModelSize("tiny_learned", belief=16, hidden=8, classes=4, units=8, cnn_depth=2, latents=4,
                     recurrence="dense", norm="layer", learned_initial=True, strided=True)  # fmt: skip
 """The 2023 architecture: dense GRU, layer norm, a learned initial state."""
-STATE_SPACE = replace(LEARNED, name="tiny_ssm", recurrence="ssm")
-"""The same with a state-space model in place of the GRU."""
 
 
 def make_agent(size: ModelSize | str = "debug", interface: Interface | None = None, seed: int = 0) -> Agent:
@@ -118,7 +115,7 @@ def exported(request: pytest.FixtureRequest, exports: Callable[[str], Path]) -> 
 # --- the step ---------------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("size", ["debug", LEARNED, STATE_SPACE], ids=["zero", "learned", "state space"])
+@pytest.mark.parametrize("size", ["debug", LEARNED], ids=["zero", "learned"])
 def test_a_reset_forgets_everything(size: ModelSize | str) -> None:
     step = ActorStep(make_agent(size))
     inputs = step.example_inputs()
@@ -163,10 +160,9 @@ def test_noise_of_zero_is_no_accident(agent: Agent) -> None:
     [
         (REFERENCE, Interface(), "sample"),
         (LEARNED, Interface(), "mode"),  # and by samples in parts, below
-        (STATE_SPACE, Interface(), "sample"),  # and by the mode in parts
         ("debug", Interface(pixels=False, vector_dim=21), "mode"),  # and images in both, above
     ],
-    ids=["block-sample", "learned-mode", "state space-sample", "vector-mode"],
+    ids=["block-sample", "learned-mode", "vector-mode"],
 )
 def test_every_architecture_flies_alike(
     size: ModelSize | str, interface: Interface, latent: str, tmp_path: Path
@@ -213,7 +209,7 @@ def test_an_export_of_another_kind_leaves_nothing_of_an_earlier_one(
 
 InParts = tuple[Path, RecordedFlight, dict[str, float]]
 """The .onnx file of a step in two parts, the flight on which it was compared, and its deviation."""
-IN_PARTS = {"gru": (LEARNED, "sample", False), "state space": (STATE_SPACE, "mode", True)}
+IN_PARTS = {"gru": (LEARNED, "sample", False), "block": (REFERENCE, "mode", True)}
 """Size, latent mode and whether the files share weights."""
 
 
@@ -262,7 +258,7 @@ def test_parts_of_another_export_are_refused(
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    shutil.copytree(in_parts("state space")[0].parent, tmp_path, dirs_exist_ok=True)  # with shared weights
+    shutil.copytree(in_parts("block")[0].parent, tmp_path, dirs_exist_ok=True)  # with shared weights
     output = tmp_path / "actor.onnx"
     contract = json.loads((tmp_path / "contract.json").read_text())
     files = contract["files"]

@@ -129,7 +129,6 @@ PRIVILEGED = 5
 INTERFACE = Interface(privileged_dim=PRIVILEGED)
 SIZES = {
     "debug": get_size("debug"),
-    "ssm": get_size("ssm_debug"),
     "reference": replace(
         get_size("size1m"), belief=32, hidden=16, latents=4, units=16, cnn_depth=8, blocks=8, actor_critic_layers=1
     ),

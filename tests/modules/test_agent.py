@@ -14,7 +14,6 @@ from torchrl.envs import EnvBase, InitTracker, TransformedEnv
 from dreamer_racing.experience.streams import records_from_rollout
 from dreamer_racing.modules.agent import Agent, DreamerPolicy
 from dreamer_racing.modules.interface import Interface
-from dreamer_racing.modules.parallel_rssm import ParallelRSSM
 from dreamer_racing.modules.rssm import CONTEXT, RSSM, LatentFormat
 from dreamer_racing.modules.sizes import SIZES
 
@@ -157,15 +156,14 @@ def test_policy_takes_any_batch_size(batch):
 # Latents that a replay keeps come back as they were.
 
 
-def make_rssm(sampled: bool, kind: type[RSSM] = RSSM) -> RSSM:
+def make_rssm(sampled: bool) -> RSSM:
     torch.manual_seed(0)
-    return kind(embedding=8, action=4, belief=16, latents=3, classes=4, hidden=8, sampled=sampled)
+    return RSSM(embedding=8, action=4, belief=16, latents=3, classes=4, hidden=8, sampled=sampled)
 
 
-@pytest.mark.parametrize("kind", [RSSM, ParallelRSSM])
 @pytest.mark.parametrize("sampled", [True, False])
-def test_latents_survive_packing(sampled, kind):
-    rssm = make_rssm(sampled, kind)
+def test_latents_survive_packing(sampled):
+    rssm = make_rssm(sampled)
     posterior = rssm.observe(torch.randn(2, 5, 8), torch.randn(2, 5, 4), torch.zeros(2, 5, dtype=torch.bool))
     packed = rssm.latent_format.pack(posterior.belief, posterior.state)
     belief, state = rssm.latent_format.unpack(packed)
@@ -190,10 +188,9 @@ def test_probabilities_draw_nothing_and_sum_to_one():
     torch.testing.assert_close(first[1].unflatten(-1, (3, 4)).sum(-1), torch.ones(6, 3))
 
 
-@pytest.mark.parametrize("kind", [RSSM, ParallelRSSM])
 @pytest.mark.parametrize("sampled", [True, False])
-def test_a_window_that_goes_on_from_stored_latents_is_the_one_that_never_stopped(sampled, kind):
-    rssm = make_rssm(sampled, kind)
+def test_a_window_that_goes_on_from_stored_latents_is_the_one_that_never_stopped(sampled):
+    rssm = make_rssm(sampled)
     embedding, action = torch.randn(3, 9, 8), torch.randn(3, 9, 4)
     is_init = torch.zeros(3, 9, dtype=torch.bool)
     is_init[1, 6] = True

@@ -22,7 +22,6 @@ SMALL = {"belief": 32, "hidden": 16, "latents": 4, "classes": 4, "units": 16}
 SIZES = {  # mostly of states that are not drawn: noise drawn ahead is other noise
     "dense": replace(get_size("paper_small"), **SMALL, cnn_depth=2, sampled=False),
     "block": replace(get_size("size1m"), **SMALL, cnn_depth=8, sampled=False),
-    "ssm": replace(get_size("ssm_debug"), sampled=False),
     "sampled": replace(get_size("debug"), state_std=False),
 }
 
@@ -64,9 +63,7 @@ def test_gradients_are_the_same_in_float32(size: str, actor: str) -> None:
 
 
 @pytest.mark.usefixtures("same_noise")
-@pytest.mark.parametrize(
-    ("size", "world_model"), [("block", "reconstruction"), ("dense", "decoder_free"), ("ssm", "decoder_free")]
-)
+@pytest.mark.parametrize(("size", "world_model"), [("block", "reconstruction"), ("dense", "decoder_free")])
 def test_gradients_are_the_same_in_bfloat16_but_for_its_rounding(
     monkeypatch: pytest.MonkeyPatch, size: str, world_model: str
 ) -> None:

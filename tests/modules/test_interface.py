@@ -211,7 +211,7 @@ def make_history(sight: str, batch: int = 2, time: int = 8) -> TensorDict:
     return TensorDict({**seen, "is_init": is_init}, [batch, time])
 
 
-@pytest.mark.parametrize("recurrence", ["dense", "block", "ssm"])
+@pytest.mark.parametrize("recurrence", ["dense", "block"])
 @pytest.mark.parametrize("sight", SIGHTS)
 def test_acting_and_training_give_the_same_latents(sight, recurrence, monkeypatch):
     """Sampled actions and states, carried by the policy's own keys from step to step, with resets in the middle."""

@@ -221,12 +221,6 @@ def test_the_drift_penalty_needs_stored_latents_that_are_not_sampled(
     assert lines == ([] if reason is None else [f"policy drift penalty: off, because {reason}"])
 
 
-def test_tuned_race_works_with_a_state_space_model() -> None:
-    gru, ssm = compose("dreamer_v3", "tuned=race"), compose("dreamer_v3", "tuned=race", "model=ssm_cpu_small")
-    assert OmegaConf.to_container(gru) | {"model": None} == OmegaConf.to_container(ssm) | {"model": None}
-    assert OmegaConf.to_container(gru.model) | {"size": "ssm_cpu_small"} == OmegaConf.to_container(ssm.model)
-
-
 def test_tuned_none_is_dreamer_as_published() -> None:
     """Every number of losses, model and schedule as in the reference, or as its size says."""
     faithful, schema = compose("dreamer_v3", "tuned=none"), recipe_module("composing.schema")
@@ -248,7 +242,6 @@ def test_tuned_none_is_dreamer_as_published() -> None:
         (["model=debug"], "none"),
         (["model=size12m"], "none"),
         (["model=cpu_small"], "race"),
-        (["model=ssm_cpu_small"], "none"),
         (["budget=smoke"], "none"),
         (["env.from_pixels=false"], "none"),
         (["env=dmc", "task=walker_walk"], "suite"),

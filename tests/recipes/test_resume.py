@@ -114,8 +114,8 @@ RACE = [
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "tuned"),
-    [("dreamer_v3", ["tuned=none"]), ("latent_ppo", [*RACE, "loss.ppo.steps=128", "model=ssm_debug"])],
-    ids=["none", "race in a state-space model"],
+    [("dreamer_v3", ["tuned=none"]), ("latent_ppo", [*RACE, "loss.ppo.steps=128", "model=debug"])],
+    ids=["none", "race"],
 )
 def test_a_resumed_run_equals_an_uninterrupted_one(name: str, tuned: list[str], tmp_path: Path) -> None:
     train(tmp_path, *SETTINGS, *tuned, "track=circle", "env=faithful", "run_dir=whole", name=name)
