@@ -21,8 +21,7 @@ from torch import Tensor
 
 from dreamer_racing.envs.drone.parameters import load_preset, without_randomisation
 from dreamer_racing.envs.race.pilot import ScriptedPilot
-from dreamer_racing.envs.simulator.base import Simulator
-from dreamer_racing.envs.simulator.mujoco_cpu import MujocoSimulator
+from dreamer_racing.envs.simulator.mujoco_cpu import MujocoSimulator, Simulator
 from dreamer_racing.envs.simulator.mujoco_warp import WarpSimulator
 from dreamer_racing.envs.simulator.rendering import RENDERERS
 from dreamer_racing.envs.tracks import PLAIN_TRACKS, load_track

@@ -51,8 +51,8 @@ from dreamer_racing.envs.own import (
 )
 from dreamer_racing.envs.race.race import EPISODE_TIME, EVALUATION_TIME, Race, RaceStep, RaceVector, RewardWeights
 from dreamer_racing.envs.race.starts import StartSampler
-from dreamer_racing.envs.simulator.base import DroneState
 from dreamer_racing.envs.simulator.fused_flight import FusedFlight
+from dreamer_racing.envs.simulator.mujoco_cpu import DroneState
 from dreamer_racing.envs.simulator.scene import (
     CAMERA_NAME,
     HALL_GROUP,

@@ -3,9 +3,8 @@
 import torch
 
 from dreamer_racing.envs.drone.parameters import QuadrotorParameters
-from dreamer_racing.envs.simulator.base import Simulator
 from dreamer_racing.envs.simulator.looks import LooksRandomisation
-from dreamer_racing.envs.simulator.mujoco_cpu import MujocoSimulator
+from dreamer_racing.envs.simulator.mujoco_cpu import MujocoSimulator, Simulator
 from dreamer_racing.envs.simulator.mujoco_warp import WarpSimulator
 from dreamer_racing.envs.simulator.scene import Camera
 from dreamer_racing.envs.tracks import Track

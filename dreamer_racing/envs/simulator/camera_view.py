@@ -1,4 +1,4 @@
-"""Pinhole projection of `scene.Camera` in torch: points in the nose camera's axes, and whether they are in view.
+"""The nose camera's geometry in torch: its pose on a drone, points in its axes, and whether they are in view.
 
 Shapes: M drones, L points.
 """
@@ -10,12 +10,45 @@ import math
 import torch
 from torch import Tensor
 
-from dreamer_racing.envs.drone.rotation import rotate, rotate_inverse
+from dreamer_racing.envs.drone.rotation import rotate
 from dreamer_racing.envs.simulator.scene import Camera
 
 
+class NoseMount:
+    """Computes the camera poses of drones.
+
+    Args:
+        camera: the nose camera.
+        device: device of the poses.
+        dtype: floating-point type of the poses.
+    """
+
+    def __init__(self, camera: Camera, device: torch.device | str = "cpu", dtype: torch.dtype = torch.float64) -> None:
+        self._mount = torch.tensor(camera.position, device=device, dtype=dtype)
+        self._tilt = torch.tensor([camera.tilt], device=device, dtype=dtype)
+
+    def __call__(self, position: Tensor, attitude: Tensor, tilt: Tensor | None = None) -> tuple[Tensor, Tensor]:
+        """Return the camera poses.
+
+        Args:
+            position: positions of the drones, (M, 3), m.
+            attitude: attitudes of the drones, (M, 4) wxyz.
+            tilt: tilts of the cameras, (M,), degrees upwards; the camera's own if None.
+
+        Returns:
+            Camera positions (M, 3), and axes (M, 3, 3) with rows right, up, backwards, in the world.
+        """
+        angle = torch.deg2rad(self._tilt if tilt is None else tilt)
+        cosine, sine, zero = angle.cos(), angle.sin(), torch.zeros_like(angle)
+        right = torch.stack((zero, zero - 1.0, zero), -1)
+        up, backwards = torch.stack((-sine, zero, cosine), -1), torch.stack((-cosine, zero, -sine), -1)
+        axes = torch.stack((right, up, backwards), 1).expand(len(position), -1, -1)  # (M, 3, 3) in the body frame
+        eye = position + rotate(attitude, self._mount.expand_as(position))
+        return eye, rotate(attitude.unsqueeze(1).expand(-1, 3, -1), axes)
+
+
 def points_in_camera(position: Tensor, attitude: Tensor, points: Tensor, camera: Camera) -> Tensor:
-    """Return points in the camera's axes.
+    """Return points in the axes of drones' cameras.
 
     Args:
         position: positions of the drones, (M, 3), m.
@@ -26,12 +59,9 @@ def points_in_camera(position: Tensor, attitude: Tensor, points: Tensor, camera:
     Returns:
         (M, L, 3) m: along the optical axis, to the left, and up in the image.
     """
-    mount = torch.tensor(camera.position, dtype=position.dtype, device=position.device)
-    eye = position + rotate(attitude, mount.expand_as(position))  # (M, 3)
-    body = rotate_inverse(attitude.unsqueeze(1).expand(-1, points.shape[-2], 4), points - eye.unsqueeze(1))  # (M, L, 3)
-    x, left, z = body.unbind(-1)
-    cosine, sine = math.cos(math.radians(camera.tilt)), math.sin(math.radians(camera.tilt))
-    return torch.stack((cosine * x + sine * z, left, cosine * z - sine * x), dim=-1)
+    eye, axes = NoseMount(camera, position.device, position.dtype)(position, attitude)
+    right, up, backwards = ((points - eye.unsqueeze(1)) @ axes.mT).unbind(-1)
+    return torch.stack((-backwards, -right, up), dim=-1)
 
 
 def is_in_view(points: Tensor, camera: Camera) -> Tensor:

@@ -20,7 +20,7 @@ from dreamer_racing.envs.drone.parameters import GRAVITY, ROTOR_SPINS
 from dreamer_racing.envs.drone.quadrotor import Quadrotor
 from dreamer_racing.envs.drone.rate_loop import DroneParameter
 from dreamer_racing.envs.simulator import fused_rate_loop
-from dreamer_racing.envs.simulator.warp_device import load_warp, scope
+from dreamer_racing.envs.simulator.warp_device import load_warp
 
 
 class Kernels(NamedTuple):
@@ -40,7 +40,7 @@ class Kernels(NamedTuple):
 
 
 class FusedFlight:
-    """Simulates N quadrotors with MuJoCo's rigid bodies and fused kernels.
+    """Simulates N quadrotors with MuJoCo's rigid bodies and fused kernels; on CUDA, within `warp_device.scope`.
 
     Args:
         quadrotor: controllers and motors, whose tensors are updated in place.
@@ -59,7 +59,7 @@ class FusedFlight:
         warp = load_warp()
         kernels = make_kernels(qpos.dtype)
         steps, num_drones = quadrotor.parameters.physics_steps, len(qpos)
-        self._device, self._integrate, self._position = qpos.device, integrate, qpos[:, :3]
+        self._integrate, self._position = integrate, qpos[:, :3]
         self._path = torch.empty(steps + 1, num_drones, 3, dtype=qpos.dtype, device=qpos.device)
         self.qvel_before = before = torch.zeros_like(qvel, memory_format=torch.contiguous_format)
         drones = quadrotor.own_parameters()
@@ -69,24 +69,23 @@ class FusedFlight:
         constants.firmware = fused_rate_loop.fill(quadrotor.rate_loop, kernels.firmware)
         force, saved, path = (warp.from_torch(tensor) for tensor in (qfrc_applied, before, self._path))
         effort = warp.from_torch(quadrotor.effort)
-        with scope(self._device):
-            self._apply_controls, self._correct_step = (
-                [
-                    warp.launch(kernel, num_drones, inputs=[index, constants, *inputs], record_cmd=True)
-                    for index in range(steps)
-                ]
-                for kernel, inputs in (
-                    (kernels.apply_controls, [*arrays, *own, effort, force, saved]),
-                    (kernels.correct_step, [*arrays[:2], saved, path]),
-                )
+        device = warp.device_from_torch(qpos.device)
+        self._apply_controls, self._correct_step = (
+            [
+                warp.launch(kernel, num_drones, inputs=[index, constants, *inputs], device=device, record_cmd=True)
+                for index in range(steps)
+            ]
+            for kernel, inputs in (
+                (kernels.apply_controls, [*arrays, *own, effort, force, saved]),
+                (kernels.correct_step, [*arrays[:2], saved, path]),
             )
+        )
 
     def fly(self) -> Tensor:
         """Simulate one control step with the current command; return the positions (P + 1, N, 3)."""
         self._path[0] = self._position
-        with scope(self._device):
-            for index in range(len(self._apply_controls)):
-                self.step(index)
+        for index in range(len(self._apply_controls)):
+            self.step(index)
         return self._path.clone()
 
     def step(self, physics_step: int) -> None:

@@ -1,21 +1,158 @@
-"""N worlds on CPU: MuJoCo's C engine with native batching for the rigid bodies, and a renderer for their cameras."""
+"""`Simulator`, N worlds with one drone each, and its CPU backend: MuJoCo's C engine with native batching.
+
+Shapes: N worlds, P physics steps per control step. SI units, attitude wxyz.
+"""
 
 import ctypes
 import os
 import weakref
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import Any
 
 import mujoco
 import torch
 from mujoco.batch import Batch
 from torch import Tensor
 
-from dreamer_racing.envs.drone.parameters import QuadrotorParameters
-from dreamer_racing.envs.simulator.base import Simulator, no_images
+from dreamer_racing.envs.drone.parameters import GRAVITY, QuadrotorParameters
+from dreamer_racing.envs.drone.quadrotor import Quadrotor
+from dreamer_racing.envs.drone.rotation import rotate_inverse
+from dreamer_racing.envs.simulator.fused_flight import FusedFlight
 from dreamer_racing.envs.simulator.looks import LooksRandomisation, LooksSampler
+from dreamer_racing.envs.simulator.ray_caster import RayCaster
 from dreamer_racing.envs.simulator.rendering import Renderer, make_renderer
 from dreamer_racing.envs.simulator.scene import Camera, build_drone, build_scene
 from dreamer_racing.envs.tracks import Track
 from dreamer_racing.machine import usable_threads
+
+
+@dataclass(frozen=True)
+class DroneState:
+    """Rigid-body state of N drones."""
+
+    position: Tensor  # (N, 3) m, world
+    attitude: Tensor  # (N, 4) wxyz, body → world
+    linear_velocity: Tensor  # (N, 3) m/s, world
+    body_rates: Tensor  # (N, 3) rad/s, body frame
+
+
+class Simulator:
+    """Base class of simulators of N worlds with one drone each.
+
+    Controllers and motors are the same for every backend. A backend provides the engine's state tensors, a function
+    that advances them by one physics step, and a renderer.
+
+    Args:
+        parameters: the drone.
+        qpos: (N, 7) the engine's positions and attitudes.
+        qvel: (N, 6) the engine's velocities (world) and body rates (body frame).
+        qfrc_applied: (N, 6) the forces (world) and torques (body frame) that the engine applies.
+        integrate: makes one physics step.
+        generator: source of the physics randomisation, on the tensors' device.
+
+    Attributes:
+        state: the current state; views that the next step overwrites.
+        renderer: draws the nose cameras' images; None if there are none.
+        looks: the sampler of each world's looks; None if looks do not vary.
+    """
+
+    renderer: Renderer | RayCaster | None = None
+    looks: LooksSampler | None = None
+    _without_images = "was made with renderer=None"
+
+    def __init__(
+        self,
+        parameters: QuadrotorParameters,
+        qpos: Tensor,
+        qvel: Tensor,
+        qfrc_applied: Tensor,
+        integrate: Callable[[], None],
+        generator: torch.Generator | None = None,
+    ) -> None:
+        self.parameters = parameters
+        self.device, self.dtype = qpos.device, qpos.dtype
+        self.quadrotor = Quadrotor(parameters, len(qpos), self.device, self.dtype, generator)
+        self._qpos, self._qvel = qpos, qvel
+        self.state = DroneState(qpos[:, :3], qpos[:, 3:], qvel[:, :3], qvel[:, 3:])
+        self._flight = FusedFlight(self.quadrotor, qpos, qvel, qfrc_applied, integrate)
+
+    def reset(self, mask: Tensor, position: Tensor, attitude: Tensor, linear_velocity: Tensor) -> None:
+        """Set the masked drones (N,) bool to the given poses and velocities (N, ·), not rotating, rotors at hover."""
+        rows = mask.unsqueeze(-1)
+        pose = torch.cat((position, attitude), dim=1).to(self.dtype)
+        velocity = torch.nn.functional.pad(linear_velocity.to(self.dtype), (0, 3))
+        self._qpos.copy_(torch.where(rows, pose, self._qpos))
+        for velocities in (self._qvel, self._flight.qvel_before):
+            velocities.copy_(torch.where(rows, velocity, velocities))
+        self.quadrotor.reset(mask)
+        if self.looks is not None:
+            self.looks.reset(mask)
+
+    def step(self, action: Tensor) -> Tensor:
+        """Simulate one control step with finite actions (N, 4).
+
+        Returns:
+            (P + 1, N, 3) positions from the start to the end of the step, one per physics step.
+        """
+        self.quadrotor.command(action)
+        return self._flight.fly()
+
+    def ideal_imu(self) -> Tensor:
+        """Return ideal gyro and accelerometer measurements of each drone: body rates and specific force (N, 6).
+
+        At its centre, in rad/s and m/s², body frame; the specific force is (0, 0, 9.81) at rest. It is that of the last
+        physics step; after a reset, that of an unaccelerated drone.
+        """
+        change = self.state.linear_velocity - self._flight.qvel_before[:, :3]
+        change[:, 2] += GRAVITY * self.parameters.physics_dt
+        force = rotate_inverse(self.state.attitude, change / self.parameters.physics_dt)
+        return torch.cat((self.state.body_rates, force), dim=1)
+
+    def render(self, rows: Tensor | None = None) -> Tensor:
+        """Return images of the nose cameras, uint8 (M, height, width, 3).
+
+        Args:
+            rows: the worlds to render, a mask (N,) bool or indices (M,); all if None.
+
+        Raises:
+            RuntimeError: this simulator has no renderer, or is closed.
+        """
+        if self.renderer is None:
+            raise RuntimeError(f"This simulator cannot render images: it {self._without_images}.")
+        position, attitude = self.state.position, self.state.attitude
+        looks = None if self.looks is None else self.looks.looks
+        if rows is not None:
+            position, attitude, looks = position[rows], attitude[rows], None if looks is None else looks[rows]
+        return self.renderer.render(position, attitude, looks)
+
+    def state_dict(self) -> dict[str, Any]:
+        """Return the complete state that the next step depends on, for `torch.save`."""
+        return {
+            "qpos": self._qpos.clone(),
+            "qvel": self._qvel.clone(),
+            "quadrotor": self.quadrotor.state_dict(),
+            "looks": None if self.looks is None else self.looks.state_dict(),
+        }
+
+    def load_state_dict(self, state_dict: Mapping[str, Any]) -> None:
+        """Restore what `state_dict` returned."""
+        self._qpos.copy_(state_dict["qpos"])
+        self._qvel.copy_(state_dict["qvel"])
+        self.quadrotor.load_state_dict(state_dict["quadrotor"])
+        looks = state_dict.get("looks")
+        if (looks is None) != (self.looks is None):
+            saved, present = ("nominal" if missing else "randomised" for missing in (looks is None, self.looks is None))
+            raise ValueError(f"looks={present}: the saved worlds have looks={saved}, so resume with that.")
+        if self.looks is not None and looks is not None:
+            self.looks.load_state_dict(looks)
+
+    def close(self) -> None:
+        """Free the renderer's contexts and threads."""
+        if self.renderer is not None:
+            self.renderer.close()
+            self.renderer, self._without_images = None, "is closed"
+
 
 _batches: weakref.WeakSet[Batch] = weakref.WeakSet()
 
@@ -74,24 +211,9 @@ class MujocoSimulator(Simulator):
         _batches.add(batch)
         qpos, qvel, force = (torch.from_numpy(batch.bind(name)) for name in ("qpos", "qvel", "qfrc_applied"))
         super().__init__(parameters, qpos, qvel, force, batch.step, generator)
-        self.renderer: Renderer | None = None
-        self._closed = False
         if renderer is not None:
             camera = camera or Camera()
             scene = build_scene(track, parameters, camera).compile()
             self.renderer = make_renderer(renderer, scene, camera, num_envs, num_threads, looks is not None)
             if looks is not None:
                 self.looks = LooksSampler(looks, scene, camera, num_envs, self.device, self.dtype, generator)
-
-    def render(self, rows: Tensor | None = None) -> Tensor:
-        """Return images uint8 (M, height, width, 3) of all worlds, or of M rows: a mask (N,) bool, or indices (M,)."""
-        if self.renderer is None:
-            raise no_images(self._closed)
-        return self.renderer.render(*self._frames(rows))
-
-    def close(self) -> None:
-        """Free the renderer's contexts and threads."""
-        if self.renderer is not None:
-            self.renderer.close()
-            self.renderer = None
-            self._closed = True

@@ -2,6 +2,7 @@
 
 import dataclasses
 from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import mujoco
@@ -9,10 +10,9 @@ import torch
 from torch import Tensor
 
 from dreamer_racing.envs.drone.parameters import QuadrotorParameters
-from dreamer_racing.envs.simulator.base import Simulator, no_images
 from dreamer_racing.envs.simulator.looks import LooksRandomisation, LooksSampler
+from dreamer_racing.envs.simulator.mujoco_cpu import Simulator
 from dreamer_racing.envs.simulator.ray_caster import RayCaster
-from dreamer_racing.envs.simulator.rendering import NoseMount
 from dreamer_racing.envs.simulator.scene import Camera, build_drone, build_scene
 from dreamer_racing.envs.simulator.warp_device import load_warp, scope
 from dreamer_racing.envs.tracks import Track
@@ -60,37 +60,23 @@ class WarpSimulator(Simulator):
         data, integrate = _make_bodies(parameters, num_envs, device)
         qpos, qvel, force = (warp.to_torch(array) for array in (data.qpos, data.qvel, data.qfrc_applied))
         super().__init__(parameters, qpos, qvel, force, integrate, generator)
-        self._camera = camera or Camera()
-        self._mount = NoseMount(self._camera, self.device, self.dtype)
-        self._ray_caster: RayCaster | None = None
-        self._closed = False
         if images:
-            scene = build_scene(track, parameters, self._camera).compile()
-            self._ray_caster = RayCaster(scene, self._camera, num_envs, device, looks is not None)
+            camera = camera or Camera()
+            scene = build_scene(track, parameters, camera).compile()
+            self.renderer = RayCaster(scene, camera, num_envs, device, looks is not None)
             if looks is not None:
-                self.looks = LooksSampler(looks, scene, self._camera, num_envs, device, self.dtype, generator)
+                self.looks = LooksSampler(looks, scene, camera, num_envs, device, self.dtype, generator)
 
-    def render(self, rows: Tensor | None = None) -> Tensor:
-        """Return images uint8 (M, height, width, 3) of all worlds, or of M rows: a mask (N,) bool, or indices (M,)."""
-        if self._ray_caster is None:
-            raise no_images(self._closed)
-        position, attitude, looks = self._frames(rows)
-        eye, axes = self._mount(position, attitude, None if looks is None else looks.camera_tilt)
-        shape = (len(position), self._camera.height, self._camera.width, 3)
-        images = torch.empty(shape, dtype=torch.uint8, device=self.device)
-        self._ray_caster.draw(eye, axes, images, looks)
-        return images
-
-    def close(self) -> None:
-        """Free the renderer."""
-        self._closed = self._closed or self._ray_caster is not None
-        self._ray_caster = None
+    def step(self, action: Tensor) -> Tensor:
+        """Simulate one control step on torch's current stream; see `Simulator.step`."""
+        with scope(self.device):
+            return super().step(action)
 
 
 def _make_bodies(
     parameters: QuadrotorParameters, num_envs: int, device: torch.device
 ) -> tuple[Any, Callable[[], None]]:
-    """Make N drones in empty worlds; return their data and a function that makes one physics step."""
+    """Make N drones in empty worlds; return their data and a function that makes one physics step, in a `scope`."""
     load_warp()
     import mujoco_warp
 
@@ -98,11 +84,7 @@ def _make_bodies(
     with scope(device):
         model, data = mujoco_warp.put_model(drone), _make_data(drone, num_envs)
 
-    def integrate() -> None:
-        with scope(device):
-            mujoco_warp.step(model, data)
-
-    return data, integrate
+    return data, partial(mujoco_warp.step, model, data)
 
 
 def _check_memory(needed: int, num_envs: int, device: torch.device) -> None:

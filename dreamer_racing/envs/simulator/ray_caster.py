@@ -6,6 +6,7 @@ import mujoco
 import torch
 from torch import Tensor
 
+from dreamer_racing.envs.simulator.camera_view import NoseMount
 from dreamer_racing.envs.simulator.looks import Looks
 from dreamer_racing.envs.simulator.scene import HALL_GROUP, Camera
 from dreamer_racing.envs.simulator.warp_device import load_warp, scope
@@ -33,7 +34,8 @@ class RayCaster:
         warp = load_warp()
         import mujoco_warp
 
-        self._render, self._device = mujoco_warp.render, torch.device(device)
+        self._render, self._device, self._size = mujoco_warp.render, torch.device(device), (camera.height, camera.width)
+        self._mount = NoseMount(camera, device, torch.float32)
         with scope(self._device):
             data = mujoco.MjData(model)
             mujoco.mj_forward(model, data)
@@ -58,7 +60,7 @@ class RayCaster:
         self._position = warp.to_torch(self._data.cam_xpos)[:, 0]  # (frames, 3)
         self._axes = warp.to_torch(self._data.cam_xmat)[:, 0]  # (frames, 3, 3) columns: right, up, backwards
         packed = warp.to_torch(self._context.rgb_data).view(torch.uint8)  # (frames, H * W * 4)
-        self._pixels = packed.unflatten(-1, (camera.height, camera.width, 4))[..., :3]
+        self._pixels = packed.unflatten(-1, (*self._size, 4))[..., :3]
 
     def _vary(self, frames: int) -> tuple[Tensor, Tensor]:
         """Allocate separate materials and cameras for every frame; return views of colours and fields of view."""
@@ -66,6 +68,13 @@ class RayCaster:
         model.mat_rgba = warp.from_torch(warp.to_torch(model.mat_rgba)[:1].repeat(frames, 1, 1), dtype=warp.vec4)
         model.cam_fovy = warp.from_torch(warp.to_torch(model.cam_fovy)[:1].repeat(frames, 1))
         return warp.to_torch(model.mat_rgba)[..., :3], warp.to_torch(model.cam_fovy)[:, 0]
+
+    def render(self, position: Tensor, attitude: Tensor, looks: Looks | None = None) -> Tensor:
+        """Return images (M, height, width, 3) of drones at positions (M, 3) with attitudes (M, 4), wxyz."""
+        eye, axes = self._mount(position, attitude, None if looks is None else looks.camera_tilt)
+        images = torch.empty((len(position), *self._size, 3), dtype=torch.uint8, device=position.device)
+        self.draw(eye, axes, images, looks)
+        return images
 
     def draw(self, position: Tensor, axes: Tensor, out: Tensor, looks: Looks | None = None) -> None:
         """Render from camera positions (m, 3) and axes (m, 3, 3; rows right, up, backwards) into out (m, H, W, 3)."""

@@ -32,7 +32,7 @@ import mujoco
 import torch
 from torch import Tensor
 
-from dreamer_racing.envs.drone.rotation import rotate
+from dreamer_racing.envs.simulator.camera_view import NoseMount
 from dreamer_racing.envs.simulator.looks import Looks
 from dreamer_racing.envs.simulator.opengl import (
     GL_LIBRARIES,
@@ -50,39 +50,6 @@ RENDERERS = ("egl", "osmesa", "warp")
 WARP_CUDA = "warp_cuda"
 EXIT_PATIENCE = 10.0
 """Maximum time for which the exit of the process waits for a frame that is being rendered, s [choice]."""
-
-
-class NoseMount:
-    """Computes the camera poses of drones.
-
-    Args:
-        camera: the nose camera.
-        device: device of the poses.
-        dtype: floating-point type of the poses.
-    """
-
-    def __init__(self, camera: Camera, device: torch.device | str = "cpu", dtype: torch.dtype = torch.float64) -> None:
-        self._mount = torch.tensor(camera.position, device=device, dtype=dtype)
-        self._tilt = torch.tensor([camera.tilt], device=device, dtype=dtype)
-
-    def __call__(self, position: Tensor, attitude: Tensor, tilt: Tensor | None = None) -> tuple[Tensor, Tensor]:
-        """Return the camera poses.
-
-        Args:
-            position: positions of the drones, (M, 3), m.
-            attitude: attitudes of the drones, (M, 4) wxyz.
-            tilt: tilts of the cameras, (M,), degrees upwards; the camera's own if None.
-
-        Returns:
-            Camera positions (M, 3), and axes (M, 3, 3) with rows right, up, backwards, in the world.
-        """
-        angle = torch.deg2rad(self._tilt if tilt is None else tilt)
-        cosine, sine, zero = angle.cos(), angle.sin(), torch.zeros_like(angle)
-        right = torch.stack((zero, zero - 1.0, zero), -1)
-        up, backwards = torch.stack((-sine, zero, cosine), -1), torch.stack((-cosine, zero, -sine), -1)
-        axes = torch.stack((right, up, backwards), 1).expand(len(position), -1, -1)  # (M, 3, 3) in the body frame
-        eye = position + rotate(attitude, self._mount.expand_as(position))
-        return eye, rotate(attitude.unsqueeze(1).expand(-1, 3, -1), axes)
 
 
 class Worker(Protocol):
