@@ -32,29 +32,19 @@ STORED = Path(__file__).with_name("racing_lines.npz")
 
 @dataclass(frozen=True)
 class LineLimits:
-    """Limits of the racing line.
+    """Limits of the racing line."""
 
-    Args:
-        speed: largest fraction of the maximum collective thrust that the line may use; sets the aggressiveness. 0.9
-            leaves a margin for corrections and for randomised drones with 14 % less thrust; above 0.95 the laps get no
-            faster.
-        gate_offset: maximum distance from a gate's centre to the left and up, m; at most 40 % of the half opening.
-        body_rate_max: maximum roll and pitch rate, rad/s.
-        angular_acceleration_max: maximum roll and pitch acceleration, rad/s².
-        thrust_min: minimum collective thrust, m/s²; near zero thrust the attitude is undefined.
-        gate_cosine: minimum cosine of the angle between the velocity and a gate's normal.
-        clearance: minimum distance from the bounding box, m.
-        height_min: minimum height, m.
-    """
-
+    # largest fraction of the maximum collective thrust that the line may use; sets the aggressiveness. 0.9 leaves a
+    # margin for corrections and for randomised drones with 14 % less thrust; above 0.95 the laps get no faster.
     speed: float = 0.9
+    # maximum distance from a gate's centre to the left and up, m; at most 40 % of the half opening
     gate_offset: float = 0.25
-    body_rate_max: float = 6.0
-    angular_acceleration_max: float = 40.0
-    thrust_min: float = 4.0
-    gate_cosine: float = 0.75
-    clearance: float = 0.5
-    height_min: float = 0.6
+    body_rate_max: float = 6.0  # maximum roll and pitch rate, rad/s
+    angular_acceleration_max: float = 40.0  # maximum roll and pitch acceleration, rad/s²
+    thrust_min: float = 4.0  # minimum collective thrust, m/s²; near zero thrust the attitude is undefined
+    gate_cosine: float = 0.75  # minimum cosine of the angle between the velocity and a gate's normal
+    clearance: float = 0.5  # minimum distance from the bounding box, m
+    height_min: float = 0.6  # minimum height, m
 
 
 START_LINE = LineLimits(speed=0.7)
@@ -131,7 +121,7 @@ class LineNodes:
     def __init__(self, track: Track, gate_offset: float) -> None:
         dtype = torch.float64
         self.gates, self.normals = track.gate_positions(dtype=dtype), track.gate_normals(dtype=dtype)
-        self.left = track.gate_rotations(dtype=dtype)[:, :, 1]
+        self.left = torch.tensor([gate.left for gate in track.gates], dtype=dtype)
         self.gate_offset = min(gate_offset, 0.4 * track.shape.pass_half_width)
         gaps = self.gates.roll(-1, 0) - self.gates
         turns = 1.0 - (self.normals * self.normals.roll(-1, 0)).sum(-1)  # 0 for straight on, 2 for a reversal

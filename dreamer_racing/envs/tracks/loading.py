@@ -6,14 +6,13 @@ import dataclasses
 import functools
 import hashlib
 import json
-import math
-from collections.abc import Collection, Hashable
+from collections.abc import Hashable, Sequence
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import yaml
 
-from dreamer_racing.envs.tracks.track import Gate, GateShape, Track, TrackError, Vector, make_track, refusal
+from dreamer_racing.envs.tracks.track import Gate, GateShape, Track, TrackError, make_track, refusal
 from dreamer_racing.envs.tracks.validation import validate_track
 from dreamer_racing.settings import quoted, shortened, suggestion
 
@@ -43,18 +42,15 @@ def load_track(name_or_path: str | Path | Track) -> Track:
     if isinstance(name_or_path, Track):
         validate_track(name_or_path, source=f"Track({name_or_path.name!r})")
         return name_or_path
-    if isinstance(name_or_path, str) and name_or_path in BUILTIN_TRACKS:
-        return _load_builtin(name_or_path)
-    return _load_file(_find(name_or_path))
+    path = _find(name_or_path)
+    return _load_builtin(path) if path.parent == _FOLDER else _load_file(path)
 
 
 def _load_file(path: Path) -> Track:
     return read_track(_parse(path), str(path), name=path.stem)
 
 
-@functools.cache
-def _load_builtin(name: str) -> Track:
-    return _load_file(_find(name))
+_load_builtin = functools.cache(_load_file)
 
 
 def read_track(content: Any, source: str, name: str = "track") -> Track:
@@ -68,9 +64,63 @@ def read_track(content: Any, source: str, name: str = "track") -> Track:
     Raises:
         TrackError: a field is wrong, or the track cannot be flown.
     """
-    track = _TrackReader(source, name).read(content)
+    if content is None:
+        raise TrackError(f"{source}: the track file is empty; it must have gates, see docs/tracks.md.")
+    optional = ("name", "laps", "decoys", "shape", "start", "bounds")
+    fields = _mapping(content, source, "the file", ("gates",), optional)
+    gates = _gates(fields["gates"], source, "gates", "race")
+    if len(gates) < 2:
+        raise refusal(source, "gates", fields["gates"], "a list of at least 2 race gates, so that there is a lap")
+    shape = [field.name for field in dataclasses.fields(GateShape)]
+    start = _mapping(fields.get("start", {}), source, "start", (), ("position", "yaw_degrees"))
+    bounds = _mapping(fields["bounds"], source, "bounds", ("low", "high")) if "bounds" in fields else {}
+    track = make_track(
+        fields.get("name", name),
+        gates,
+        decoys=_gates(fields.get("decoys", []), source, "decoys", "decoy"),
+        shape=GateShape(**_mapping(fields.get("shape", {}), source, "shape", (), shape)),
+        start_position=start.get("position"),
+        start_yaw_degrees=start.get("yaw_degrees"),
+        bounds_low=bounds.get("low"),
+        bounds_high=bounds.get("high"),
+        laps=fields.get("laps", 3),
+        source=source,
+    )
     validate_track(track, source=source)
     return track
+
+
+def _gates(value: Any, source: str, where: str, kind: str) -> list[Gate]:
+    """Read a list of gates, whose numbers are checked later."""
+    if not isinstance(value, list):
+        raise refusal(source, where, value, "a list of gates, each with a position and yaw_degrees")
+    required, optional = ("position", "yaw_degrees"), ("kind", "color")
+    items = [_mapping(item, source, f"{where}[{index}]", required, optional) for index, item in enumerate(value)]
+    return [Gate(**{"kind": kind, **item}) for item in items]
+
+
+def _mapping(
+    value: Any, source: str, where: str, required: Sequence[str], optional: Sequence[str] = ()
+) -> dict[str, Any]:
+    """Return the fields that are not null of a mapping with all required and no unknown keys."""
+    allowed = sorted((*required, *optional))
+    if not isinstance(value, dict):
+        raise refusal(source, where, value, f"a mapping with the fields {', '.join(allowed)}")
+    prefix = "" if where == "the file" else f"{where}."
+    for key in value:
+        if key not in allowed:
+            raise TrackError(
+                f"{source}: {prefix}{shortened(str(key))} is an unknown field (its value is {quoted(value[key])})"
+                f"{suggestion(key, allowed)}; the allowed fields of {where} are {', '.join(allowed)}."
+            )
+    fields = {key: item for key, item in value.items() if item is not None}
+    for key in required:
+        if key not in fields:
+            raise TrackError(
+                f"{source}: {prefix}{key} is missing; {where} has {', '.join(fields) or 'no field'} and needs "
+                f"{', '.join(required)}."
+            )
+    return fields
 
 
 def describe_track(track: Track) -> dict[str, Any]:
@@ -96,10 +146,6 @@ def hash_track(track: Track) -> str:
     """Return the SHA-256 hash of a track's geometry and gate colours, without its name and laps.
 
     It is computed from `describe_track` as JSON with sorted keys, so it does not depend on the track's file or name.
-
-    Example:
-        >>> hash_track(load_track("kidney")) == hash_track(dataclasses.replace(load_track("kidney"), name="mine"))
-        True
     """
     geometry = {key: value for key, value in describe_track(track).items() if key not in ("name", "laps")}
     return hashlib.sha256(json.dumps(geometry, sort_keys=True).encode()).hexdigest()
@@ -175,142 +221,3 @@ def _parse(path: Path) -> Any:
         raise TrackError(f"{path}: not valid YAML at {where}: {error.problem}.") from error
     except (yaml.YAMLError, ValueError, RecursionError) as error:
         raise TrackError(f"{path}: not valid YAML: {error}.") from error
-
-
-class _TrackReader:
-    """Converts a file's content to a ``Track``; errors name the invalid field."""
-
-    def __init__(self, source: str, name: str):
-        self._source, self._name = source, name
-
-    def read(self, content: Any) -> Track:
-        """Check the type of every field and fill in the defaults."""
-        if content is None:
-            raise TrackError(f"{self._source}: the track file is empty; it must have gates, see docs/tracks.md.")
-        content = self._mapping(
-            content,
-            "the file",
-            required={"gates"},
-            optional={"name", "laps", "decoys", "shape", "start", "bounds"},
-        )
-        gates = self._gates(content["gates"], "gates", "race")
-        if len(gates) < 2:
-            raise self._error("gates", content["gates"], "a list of at least 2 race gates, so that there is a lap")
-        start_position, start_yaw_degrees = self._start(content.get("start", {}))
-        bounds_low, bounds_high = self._bounds(content["bounds"]) if "bounds" in content else (None, None)
-        return make_track(
-            self._text(content.get("name", self._name), "name"),
-            gates,
-            decoys=self._gates(content.get("decoys", []), "decoys", "decoy"),
-            shape=self._shape(content.get("shape", {})),
-            start_position=start_position,
-            start_yaw_degrees=start_yaw_degrees,
-            bounds_low=bounds_low,
-            bounds_high=bounds_high,
-            laps=self._count(content.get("laps", 3), "laps"),
-        )
-
-    def _gates(self, value: Any, where: str, kind: Literal["race", "decoy"]) -> list[Gate]:
-        """Read a list of gates of one kind."""
-        if not isinstance(value, list):
-            raise self._error(where, value, "a list of gates, each with a position and yaw_degrees")
-        return [self._gate(item, f"{where}[{index}]", kind) for index, item in enumerate(value)]
-
-    def _gate(self, value: Any, where: str, kind: Literal["race", "decoy"]) -> Gate:
-        """Read one gate."""
-        fields = self._mapping(value, where, required={"position", "yaw_degrees"}, optional={"kind", "color"})
-        if fields.get("kind", kind) != kind:
-            raise self._error(
-                f"{where}.kind",
-                fields["kind"],
-                f"{kind!r} here or left out: kinds are 'race' (listed under gates, in the order of flight) and 'decoy' "
-                "(listed under decoys, drawn only)",
-            )
-        return Gate(
-            position=self._vector(fields["position"], f"{where}.position"),
-            yaw_degrees=self._number(fields["yaw_degrees"], f"{where}.yaw_degrees"),
-            kind=kind,
-            color=self._color(fields["color"], f"{where}.color") if "color" in fields else None,
-        )
-
-    def _start(self, value: Any) -> tuple[Vector | None, float | None]:
-        """Read the start pose; a missing field is None."""
-        fields = self._mapping(value, "start", required=set(), optional={"position", "yaw_degrees"})
-        position = self._vector(fields["position"], "start.position") if "position" in fields else None
-        yaw_degrees = self._number(fields["yaw_degrees"], "start.yaw_degrees") if "yaw_degrees" in fields else None
-        return position, yaw_degrees
-
-    def _bounds(self, value: Any) -> tuple[Vector, Vector]:
-        """Read the corners of the bounding box."""
-        fields = self._mapping(value, "bounds", required={"low", "high"})
-        return self._vector(fields["low"], "bounds.low"), self._vector(fields["high"], "bounds.high")
-
-    def _shape(self, value: Any) -> GateShape:
-        """Read the dimensions of the gates."""
-        fields = self._mapping(value, "shape", required=set(), optional={"opening", "outer", "depth", "margin"})
-        return GateShape(**{name: self._number(number, f"shape.{name}") for name, number in fields.items()})
-
-    def _mapping(
-        self, value: Any, where: str, *, required: Collection[str], optional: Collection[str] = ()
-    ) -> dict[str, Any]:
-        """Read a mapping with all required and no unknown keys."""
-        allowed = sorted({*required, *optional})
-        if not isinstance(value, dict):
-            raise self._error(where, value, f"a mapping with the fields {', '.join(allowed)}")
-        prefix = "" if where == "the file" else f"{where}."
-        for key in value:
-            if key not in allowed:
-                raise TrackError(
-                    f"{self._source}: {prefix}{shortened(str(key))} is an unknown field (its value is "
-                    f"{quoted(value[key])}){suggestion(key, allowed)}; the allowed fields of {where} are "
-                    f"{', '.join(allowed)}."
-                )
-        for key in sorted(required):
-            if key not in value:
-                there = shortened(", ".join(map(str, value))) or "no field"
-                raise TrackError(
-                    f"{self._source}: {prefix}{key} is missing; {where} has {there} "
-                    f"and needs {', '.join(sorted(required))}."
-                )
-        return value
-
-    def _vector(self, value: Any, where: str) -> Vector:
-        """Read three numbers x, y, z in m."""
-        if not isinstance(value, list) or len(value) != 3:
-            raise self._error(where, value, "a list of three numbers [x, y, z] in m")
-        x, y, z = (self._number(number, f"{where}[{axis}]") for axis, number in enumerate(value))
-        return (x, y, z)
-
-    def _color(self, value: Any, where: str) -> Vector:
-        """Read red, green and blue."""
-        if not isinstance(value, list) or len(value) != 3:
-            raise self._error(where, value, "a list of three numbers [red, green, blue] from 0 to 1")
-        red, green, blue = (self._number(number, f"{where}[{axis}]") for axis, number in enumerate(value))
-        if not all(0 <= part <= 1 for part in (red, green, blue)):
-            raise self._error(where, value, "three numbers [red, green, blue] from 0 to 1")
-        return (red, green, blue)
-
-    def _number(self, value: Any, where: str) -> float:
-        """Read a finite number; booleans are refused."""
-        try:
-            if isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value):
-                return float(value)
-        except OverflowError:
-            pass  # an integer too large for a float is refused like any other bad value
-        raise self._error(where, value, "a finite number")
-
-    def _count(self, value: Any, where: str) -> int:
-        """Read a whole number of at least 1."""
-        if not isinstance(value, int) or isinstance(value, bool) or value < 1:
-            raise self._error(where, value, "a whole number of at least 1")
-        return value
-
-    def _text(self, value: Any, where: str) -> str:
-        """Read a non-empty string."""
-        if not isinstance(value, str) or not value.strip():
-            raise self._error(where, value, "a text that is not empty")
-        return value
-
-    def _error(self, where: str, value: Any, allowed: str) -> TrackError:
-        """Return the error of an invalid field."""
-        return refusal(self._source, where, value, allowed)

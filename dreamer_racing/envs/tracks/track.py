@@ -67,18 +67,13 @@ class Gate:
     """One square gate, standing upright.
 
     Numbers of any type become floats, and sequences or arrays become tuples of floats.
-
-    Args:
-        position: centre of the opening in the world, m.
-        yaw_degrees: direction of flight through the gate, degrees from the world's x axis towards y.
-        kind: ``"race"`` gates are flown in order; ``"decoy"`` gates are only rendered (no reward, crash or order).
-        color: RGB in [0, 1], or None for the scene's own colour.
     """
 
-    position: Vector
-    yaw_degrees: float
+    position: Vector  # centre of the opening in the world, m
+    yaw_degrees: float  # direction of flight through the gate, degrees from the world's x axis towards y
+    # ``"race"`` gates are flown in order; ``"decoy"`` gates are only rendered (no reward, crash or order)
     kind: Literal["race", "decoy"] = "race"
-    color: Vector | None = None
+    color: Vector | None = None  # RGB in [0, 1], or None for the scene's own colour
 
     def __post_init__(self) -> None:
         _normalise(self, ("yaw_degrees",), ("position", "color"))
@@ -98,19 +93,12 @@ class Gate:
 
 @dataclasses.dataclass(frozen=True)
 class GateShape:
-    """Dimensions shared by all gates of a track, m.
+    """Dimensions shared by all gates of a track, m."""
 
-    Args:
-        opening: side of the square opening. Reference: uzh-rpg/agile_flight.
-        outer: side of the square frame's outside. Reference: uzh-rpg/agile_flight.
-        depth: thickness of the frame along the direction of flight. Reference: uzh-rpg/agile_flight.
-        margin: on both axes, a drone's centre must pass this much inside the opening's edges [choice].
-    """
-
-    opening: float = 1.5
-    outer: float = 2.05
-    depth: float = 0.1
-    margin: float = 0.1
+    opening: float = 1.5  # side of the square opening. Reference: uzh-rpg/agile_flight.
+    outer: float = 2.05  # side of the square frame's outside. Reference: uzh-rpg/agile_flight.
+    depth: float = 0.1  # thickness of the frame along the direction of flight. Reference: uzh-rpg/agile_flight.
+    margin: float = 0.1  # on both axes, a drone's centre must pass this much inside the opening's edges [choice]
 
     def __post_init__(self) -> None:
         _normalise(self, [field.name for field in dataclasses.fields(self)], ())
@@ -123,29 +111,17 @@ class GateShape:
 
 @dataclasses.dataclass(frozen=True)
 class Track:
-    """A race track. Read one with ``load_track`` or build one with ``make_track``.
+    """A race track. Read one with ``load_track`` or build one with ``make_track``."""
 
-    Args:
-        name: short name, for logs and plots.
-        gates: race gates in the order of flight.
-        decoys: gates that are only rendered.
-        shape: dimensions of every gate.
-        start_position: position of the start pose, m.
-        start_yaw_degrees: heading of the start pose.
-        bounds_low: lower corner of the box that a drone must not leave, m.
-        bounds_high: upper corner of the same box, m.
-        laps: number of laps of an evaluation episode.
-    """
-
-    name: str
-    gates: tuple[Gate, ...]
-    decoys: tuple[Gate, ...]
-    shape: GateShape
-    start_position: Vector
-    start_yaw_degrees: float
-    bounds_low: Vector
-    bounds_high: Vector
-    laps: int = 3
+    name: str  # short name, for logs and plots
+    gates: tuple[Gate, ...]  # race gates in the order of flight
+    decoys: tuple[Gate, ...]  # gates that are only rendered
+    shape: GateShape  # dimensions of every gate
+    start_position: Vector  # position of the start pose, m
+    start_yaw_degrees: float  # heading of the start pose
+    bounds_low: Vector  # lower corner of the box that a drone must not leave, m
+    bounds_high: Vector  # upper corner of the same box, m
+    laps: int = 3  # number of laps of an evaluation episode
 
     def __post_init__(self) -> None:
         _normalise(self, ("start_yaw_degrees",), ("start_position", "bounds_low", "bounds_high"))
@@ -179,12 +155,6 @@ class Track:
         """Return the unit directions of flight through the race gates, (G, 3)."""
         return _tensor([gate.forward for gate in self.gates], device, dtype)
 
-    def gate_rotations(self, device: torch.device | str = "cpu", dtype: torch.dtype | None = None) -> torch.Tensor:
-        """Return the rotations gate → world, (G, 3, 3): their columns are forward, left and up."""
-        up = (0.0, 0.0, 1.0)
-        columns = [(gate.forward, gate.left, up) for gate in self.gates]
-        return _tensor(columns, device, dtype).mT.contiguous()
-
 
 def _tensor(values: Any, device: torch.device | str, dtype: torch.dtype | None) -> torch.Tensor:
     """Return numbers as a tensor, float32 by default; torch is imported here, as reading tracks does not need it."""
@@ -204,8 +174,9 @@ def make_track(
     bounds_low: Vector | None = None,
     bounds_high: Vector | None = None,
     laps: int = 3,
+    source: str | None = None,
 ) -> Track:
-    """Build a track with defaults for what is not given. ``load_track`` checks the result.
+    """Build a `Track` with defaults for what is not given. ``load_track`` checks the result.
 
     Args:
         name: short name, for logs and plots.
@@ -217,6 +188,7 @@ def make_track(
         bounds_low: m; None for 3 m outside the race gates' frames, from the floor.
         bounds_high: m; None for 3 m outside the race gates' frames, 6 m high.
         laps: number of laps of an evaluation episode.
+        source: origin of the numbers, for messages; the track's name if None.
 
     Raises:
         TrackError: a gate, a dimension or the start from which defaults are computed is not finite.
@@ -225,7 +197,7 @@ def make_track(
         >>> make_track("line", [Gate((0, 0, 1.35), 0), Gate((5, 0, 1.35), 0)]).start_position
         (-2.5, 0.0, 1.35)
     """
-    source, shape = f"Track({name!r})", shape or GateShape()
+    source, shape = source or f"Track({name!r})", shape or GateShape()
     require_gates(source, "gates", gates)
     require_shape(source, shape)
     if start_position is not None:

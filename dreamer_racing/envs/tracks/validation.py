@@ -92,6 +92,8 @@ def _named_gates(track: Track) -> list[tuple[str, Gate]]:
 
 def _check_numbers(track: Track, source: str) -> None:
     """Refuse invalid numbers in positions, directions, dimensions, colours and laps."""
+    if not (isinstance(track.name, str) and track.name.strip()):
+        raise refusal(source, "name", track.name, "a text that is not empty")
     for name in ("gates", "decoys"):
         require_gates(source, name, getattr(track, name))
     require_shape(source, track.shape)

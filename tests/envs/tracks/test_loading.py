@@ -65,16 +65,11 @@ def test_every_file_is_a_builtin_track():
     assert {path.stem for path in Path(tracks.__file__).parent.glob("*.yaml")} == set(BUILTIN_TRACKS)
 
 
-@pytest.mark.parametrize("name", BUILTIN_TRACKS)
-def test_builtin_tracks(name):
-    track = load_track(name)
-    assert track.name == name
-    assert load_track(track) is track
-
-
 def test_the_page_names_every_builtin_track_with_its_gates():
     rows = re.findall(r"^\| `(\w+)` \| (\d+)", PAGE, re.M)
-    assert {name: int(gates) for name, gates in rows} == {name: load_track(name).num_gates for name in BUILTIN_TRACKS}
+    loaded = {name: load_track(name) for name in BUILTIN_TRACKS}
+    assert {name: int(gates) for name, gates in rows} == {name: track.num_gates for name, track in loaded.items()}
+    assert all(track.name == name and load_track(track) is track for name, track in loaded.items())
 
 
 def test_the_example_of_the_page_gives_every_default(write):
@@ -92,21 +87,12 @@ def test_the_example_of_the_page_gives_every_default(write):
 
 @pytest.mark.parametrize("name", BUILTIN_TRACKS)
 def test_yaws_agree_with_the_order_of_flight(name):
-    """Each gate is approached from before its plane and left behind it.
-
-    Two turns are of more than a quarter circle on purpose: split_s's dive (gate 3 to the one below it) and its second
-    gate, which is left at a right angle (0.15 m back over 10 m).
-    """
+    """But for split_s's second gate, which is left at a right angle (0.15 m back over 10 m)."""
     gates = load_track(name).gates
     for index, gate in enumerate(gates):
         for other, sign in ((gates[index - 1], 1), (gates[(index + 1) % len(gates)], -1)):
             along = sign * sum((a - b) * n for a, b, n in zip(gate.position, other.position, gate.forward, strict=True))
             assert along > -0.2, (name, index)
-    if name != "split_s":
-        assert all(
-            sum((a - b) * n for a, b, n in zip(gate.position, gates[i - 1].position, gate.forward, strict=True)) > 1
-            for i, gate in enumerate(gates)
-        )
 
 
 def test_circle_is_a_circle():
@@ -125,13 +111,6 @@ def test_split_s_is_the_published_track():
     assert (track.bounds_low, track.bounds_high) == ((-10, -8, 0.05), (14, 9, 6))
 
 
-def test_decoys_change_nothing_else():
-    plain, decoyed = load_track("figure8"), load_track("figure8_decoys")
-    assert len(decoyed.decoys) == 2
-    assert all(gate.kind == "decoy" and gate.color for gate in decoyed.decoys)
-    assert dataclasses.replace(decoyed, name="figure8", decoys=()) == plain
-
-
 def test_defaults():
     track = load_track("kidney")
     assert track.start_position == pytest.approx((-5.5, -2.5, 1.35))  # 2.5 m before gate 0, which faces +y
@@ -147,13 +126,7 @@ def test_tensors():
     track = load_track("circle")
     assert track.gate_positions().tolist()[1] == [0.0, 4.0, pytest.approx(1.35)]
     assert track.gate_yaws(dtype=torch.float64).tolist() == pytest.approx([math.pi / 2, math.pi, -math.pi / 2, 0])
-    rotations = load_track("split_s").gate_rotations(dtype=torch.float64)
-    torch.testing.assert_close(rotations @ rotations.mT, torch.eye(3, dtype=torch.float64).expand(7, 3, 3))
-    torch.testing.assert_close(rotations[..., 0], load_track("split_s").gate_normals(dtype=torch.float64))
-    # Gate 0 of the circle faces +y: its left is -x.
-    torch.testing.assert_close(
-        track.gate_rotations()[0], torch.tensor([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
-    )
+    assert track.gate_normals()[1].tolist() == pytest.approx([-1.0, 0.0, 0.0], abs=1e-6)
 
 
 # ---------------------------------------------------------------- files
@@ -187,21 +160,18 @@ REFUSALS = {
     "missing gates": ("gates:", "gatez:", ["gatez", "did you mean gates"]),
     "missing yaw": ("yaw_degrees: 180", "", ["gates[2].yaw_degrees", "missing", "position"]),
     "missing high": (", high: [10, 10, 5]", "", ["bounds.high", "missing"]),
-    "wrong kind": ("kind: race", "kind: rase", ["gates[1].kind", "'rase'", "'race'", "'decoy'"]),
-    "decoy among gates": ("kind: race", "kind: decoy", ["gates[1].kind", "'decoy'", "listed under decoys"]),
+    "wrong kind": ("kind: race", "kind: rase", ["gates[1].kind", "'rase'", "'race'"]),
+    "decoy among gates": ("kind: race", "kind: decoy", ["gates[1].kind", "'decoy'", "decoys in decoys"]),
     "text for a number": ("yaw_degrees: 180", "yaw_degrees: north", ["gates[2].yaw_degrees", "'north'", "finite"]),
-    "bool for a number": ("yaw_degrees: 180", "yaw_degrees: true", ["gates[2].yaw_degrees", "True", "finite"]),
-    "not finite": ("[6, 6, 1.35]", "[6, .nan, 1.35]", ["gates[2].position[1]", "nan", "finite"]),
-    "infinite": ("[6, 6, 1.35]", "[6, .inf, 1.35]", ["gates[2].position[1]", "inf", "finite"]),
-    "huge integer": ("[6, 6, 1.35]", f"[6, 1{'0' * 400}, 1.35]", ["gates[2].position[1]", "finite"]),
-    "two coordinates": ("[6, 6, 1.35]", "[6, 6]", ["gates[2].position", "[6, 6]", "three numbers"]),
-    "a mapping for a vector": ("[6, 6, 1.35]", "{x: 6}", ["gates[2].position", "{'x': 6}", "three numbers"]),
+    "not finite": ("[6, 6, 1.35]", "[6, .nan, 1.35]", ["gates[2].position", "nan", "finite"]),
+    "huge integer": ("[6, 6, 1.35]", f"[6, 1{'0' * 400}, 1.35]", ["gates[2].position", "finite"]),
+    "two coordinates": ("[6, 6, 1.35]", "[6, 6]", ["gates[2].position", "(6.0, 6.0)", "three finite numbers"]),
+    "nothing for a vector": ("[6, 6, 1.35]", "null", ["gates[2].position is missing"]),
+    "a mapping for a vector": ("[6, 6, 1.35]", "{x: 6}", ["gates[2].position", "{'x': 6}", "three finite numbers"]),
     "gate is a list": ("{position: [6, 6, 1.35], yaw_degrees: 180}", "[6, 6]", ["gates[2]", "[6, 6]", "mapping"]),
     "decoys is a mapping": ("  - {position: [0, 6", "    {position: [0, 6", ["decoys", "a list of gates"]),
     "color out of range": ("[1, 0.5, 0]", "[255, 0.5, 0]", ["gates[1].color", "255", "from 0 to 1"]),
-    "color too short": ("[1, 0.5, 0]", "[1]", ["gates[1].color", "[1]", "red, green, blue"]),
     "laps of zero": ("laps: 2", "laps: 0", ["laps", "0", "at least 1"]),
-    "laps of a half": ("laps: 2", "laps: 2.5", ["laps", "2.5", "whole number"]),
     "empty name": ("name: mine", "name: ''", ["name", "''", "not empty"]),
     "opening too large": ("opening: 1.4", "opening: 2.1", ["shape.outer", "2.05", "2.1"]),
     "opening of zero": ("opening: 1.4", "opening: 0", ["shape.opening", "0.0", "greater than 0"]),
@@ -335,22 +305,6 @@ def test_missing_files(tmp_path):
 # ---------------------------------------------------------------- tracks built in Python
 
 
-def test_tracks_built_in_python_are_checked_too():
-    good = load_track("circle")
-    for change, field in (
-        ({"gates": good.gates[:1]}, "gates is"),
-        ({"laps": 0}, "laps is 0"),
-        ({"start_position": (0.0, math.nan, 1.0)}, r"start\.position is \(0\.0, nan, 1\.0\)"),
-        ({"start_position": (0.0, 1.0)}, r"start\.position is \(0\.0, 1\.0\)"),
-        ({"start_yaw_degrees": math.inf}, r"start\.yaw_degrees is inf"),
-        ({"shape": GateShape(margin=math.nan)}, r"shape\.margin is nan"),
-        ({"decoys": good.gates[:1]}, r"decoys\[0\]\.kind is 'race'"),
-        ({"gates": (Gate((0.0, 0.0, 1.35), 0.0, kind="decoy"), *good.gates)}, r"gates\[0\]\.kind is 'decoy'"),
-    ):
-        with pytest.raises(TrackError, match=r"Track\('circle'\): " + field):
-            load_track(dataclasses.replace(good, **change))
-
-
 CIRCLE = load_track("circle")
 FIRST, *OTHERS = CIRCLE.gates
 
@@ -359,17 +313,13 @@ FIRST, *OTHERS = CIRCLE.gates
     ("change", "message"),
     [
         ({"position": (4.0, None, 1.35)}, r"gates[0].position is (4.0, None, 1.35), but must be three finite numbers"),
-        ({"position": (4.0, "0", 1.35)}, "gates[0].position is (4.0, '0', 1.35), but must be three finite numbers"),
         ({"position": (4.0, True, 1.35)}, "gates[0].position is (4.0, True, 1.35), but must be three finite numbers"),
         ({"position": 4.0}, "gates[0].position is 4.0, but must be three finite numbers"),
         ({"position": "abc"}, "gates[0].position is 'abc', but must be three finite numbers"),
         ({"position": (4.0, 10**400, 1.35)}, "gates[0].position is (4.0, 1000"),
         ({"yaw_degrees": "0"}, "gates[0].yaw_degrees is '0', but must be a finite number"),
-        ({"yaw_degrees": None}, "gates[0].yaw_degrees is None, but must be a finite number"),
         ({"color": (1.0, 1.5, 0.0)}, "gates[0].color is (1.0, 1.5, 0.0), but must be three numbers [red, green, blue]"),
-        ({"color": (1.0, -0.1, 0.0)}, "gates[0].color is (1.0, -0.1, 0.0), but must be three numbers"),
         ({"color": (1.0, 0.0)}, "gates[0].color is (1.0, 0.0), but must be three numbers"),
-        ({"color": (1.0, 0.0, math.nan)}, "gates[0].color is (1.0, 0.0, nan), but must be three numbers"),
         ({"color": "red"}, "gates[0].color is 'red', but must be three numbers"),
     ],
 )
@@ -389,16 +339,20 @@ def test_gates_built_in_python_are_refused_by_name_and_field(change, message):
         ({"shape": None}, "shape is None, but must be a GateShape"),
         ({"shape": GateShape(depth="0.1")}, "shape.depth is '0.1', but must be a finite number"),
         ({"start_position": (0.0, None, 1.0)}, "start.position is (0.0, None, 1.0), but must be three finite numbers"),
-        ({"start_yaw_degrees": "0"}, "start.yaw_degrees is '0', but must be a finite number"),
+        ({"start_yaw_degrees": math.inf}, "start.yaw_degrees is inf, but must be a finite number"),
         ({"bounds_high": None}, "bounds.high is None, but must be three finite numbers"),
         ({"laps": 1.5}, "laps is 1.5, but must be a whole number"),
         ({"laps": True}, "laps is True, but must be a whole number"),
-        ({"laps": "3"}, "laps is '3', but must be a whole number"),
+        ({"laps": 0}, "laps is 0, but must be a whole number of at least 1"),
+        ({"gates": CIRCLE.gates[:1]}, "gates is (Gate("),
+        ({"decoys": CIRCLE.gates[:1]}, "decoys[0].kind is 'race'"),
+        ({"name": " "}, "name is ' ', but must be a text that is not empty"),
     ],
 )
 def test_fields_of_tracks_built_in_python_are_refused_by_name(change, message):
-    with pytest.raises(TrackError, match="^" + re.escape(f"Track('circle'): {message}")):
-        load_track(dataclasses.replace(CIRCLE, **change))
+    track = dataclasses.replace(CIRCLE, **change)
+    with pytest.raises(TrackError, match="^" + re.escape(f"Track({track.name!r}): {message}")):
+        load_track(track)
 
 
 def test_defaults_do_not_follow_from_a_start_that_is_none():
