@@ -15,7 +15,7 @@ from pathlib import Path
 
 from composing.entry import plain_errors, recipe
 
-from dreamer_racing.envs.drone.variations import SUFFIXES
+from dreamer_racing.envs.drone.parameters import SUFFIXES
 
 
 @dataclass

@@ -19,8 +19,7 @@ def make_kernel() -> Any:
     """Make the kernel that advances one flight controller by 1 ms."""
     wp = load_warp()
     vec3 = wp.types.vector(3, wp.float64)
-    rate_loop = fused_rate_loop.make_kernels(torch.float64)
-    Firmware, motor_commands = rate_loop.firmware, rate_loop.motor_commands
+    Firmware, motor_commands = fused_rate_loop.make_kernels(torch.float64)
 
     @wp.kernel
     def advance(
@@ -53,7 +52,7 @@ class RateController:
         tensors = [torch.zeros(size, dtype=torch.float64) for size in (4, 3, 4)]
         self._setpoint, self._gyro, self._motors = (tensor.numpy() for tensor in tensors)
         wp = load_warp()
-        common = fused_rate_loop.fill(loop, fused_rate_loop.make_kernels(torch.float64).firmware)
+        common = fused_rate_loop.fill(loop, fused_rate_loop.make_kernels(torch.float64)[0])
         inputs = [common, *map(wp.from_torch, tensors), *fused_rate_loop.arrays(loop, tensors[0])]
         self._advance = wp.launch(make_kernel(), 1, inputs=inputs, device="cpu", record_cmd=True)
 

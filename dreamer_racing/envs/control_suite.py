@@ -26,7 +26,6 @@ Reference: danijar/dreamerv3, embodied/envs/dmc.py and dreamerv3/configs.yaml of
 `repeat: 1`), for camera, image size and action repeat; Tassa et al., dm_control, arXiv 2006.12983, for the tasks.
 """
 
-import difflib
 import math
 from collections.abc import Mapping
 from typing import Any
@@ -43,7 +42,7 @@ from tensordict import TensorDict, TensorDictBase
 from torchrl.data import Bounded, Composite, Unbounded
 from torchrl.envs import EnvBase
 
-from dreamer_racing.settings import check_numbers, without_none
+from dreamer_racing.settings import check_numbers, suggestion, without_none
 
 TASKS = {f"{domain}_{name}": (domain, name) for domain, name in suite.ALL_TASKS}
 """Domain and task of the suite, by the name `domain_task`."""
@@ -230,16 +229,6 @@ class SuiteWorld:
         camera: number or name of the camera; None for no images.
         image_size: width and height of the images.
         limit: simulator steps after which an episode is truncated, if before the task's time limit; None for no limit.
-
-    Attributes:
-        action_size: A.
-        vector_size: V.
-        terminated: whether the last step ended the episode with discount 0.
-        truncated: whether the last step ended the episode at a limit.
-
-    Raises:
-        ValueError: unknown camera.
-        RendererUnavailableError: dm_control has no OpenGL that works here.
     """
 
     def __init__(
@@ -248,7 +237,7 @@ class SuiteWorld:
         self.seed = seed
         self._limit = math.inf if limit is None else limit
         self.env: control.Environment = suite.load(*TASKS[task], task_kwargs={"random": seed})
-        self.terminated = self.truncated = False
+        self.terminated = self.truncated = False  # whether the last step ended the episode: discount 0, or a limit
         self._episode_start = self._random_state()
         self._begun = False
         action = self.env.action_spec()
@@ -366,9 +355,7 @@ class SuiteWorld:
 def _check_arguments(task: str, action_repeat: int, counts: Mapping[str, Any]) -> None:
     """Refuse an unknown task, and counts (by name) that are not positive whole numbers."""
     if task not in TASKS:
-        close = difflib.get_close_matches(task, TASKS, n=3)
-        hint = f"did you mean {' or '.join(close)}? " if close else ""
-        raise ValueError(f"Unknown task {task!r}: {hint}The tasks are {', '.join(TASKS)}.")
+        raise ValueError(f"Unknown task {task!r}{suggestion(task, TASKS)}. The tasks are {', '.join(TASKS)}.")
     check_numbers(counts, {})
     for name, what in (("num_envs", "world"), ("image_size", "pixel"), ("episode_steps", "action")):
         if counts.get(name, 1) < 1:

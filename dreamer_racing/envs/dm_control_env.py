@@ -37,18 +37,10 @@ from dm_control.suite import base
 from dm_env import specs
 from torch import Tensor
 
-from dreamer_racing.envs.drone.parameters import GRAVITY, QuadrotorParameters, at_control_rate, load_preset
-from dreamer_racing.envs.drone.quadrotor import Quadrotor, wrong_action_type
-from dreamer_racing.envs.drone.rotation import rotate_inverse
+from dreamer_racing.envs.drone.parameters import QuadrotorParameters, at_control_rate, load_preset
+from dreamer_racing.envs.drone.quadrotor import Quadrotor
 from dreamer_racing.envs.imu import Imu, ImuErrors, load_imu
-from dreamer_racing.envs.own import (
-    CustomFunction,
-    RaceState,
-    RaceStates,
-    RewardFunction,
-    Transition,
-    VectorFunction,
-)
+from dreamer_racing.envs.own import CustomFunction, RaceState, RaceStates, RewardFunction, Transition, VectorFunction
 from dreamer_racing.envs.race.race import EPISODE_TIME, EVALUATION_TIME, Race, RaceStep, RaceVector, RewardWeights
 from dreamer_racing.envs.race.starts import StartSampler
 from dreamer_racing.envs.simulator.fused_flight import FusedFlight
@@ -62,12 +54,10 @@ from dreamer_racing.envs.simulator.scene import (
     load_camera,
 )
 from dreamer_racing.envs.tracks import Track, load_track
-from dreamer_racing.envs.worlds import ACTION_SIZE
+from dreamer_racing.envs.worlds import ACTION_SIZE, check_action
 from dreamer_racing.settings import check_flags, check_numbers, without_none
 
 FRAMEBUFFER = (1280, 960)  # width and height of the largest image that `physics.render` can return
-
-
 MOST_STEPS = 2**31 - 1  # of an episode without a time limit: more than a year
 
 
@@ -117,12 +107,10 @@ def load(
         >>> env.step(env.action_spec().generate_value()).discount
         1.0
     """
-    check_numbers({}, without_none(control_rate=control_rate, time_limit=time_limit))
+    check_numbers({}, without_none(time_limit=time_limit))
     check_flags(evaluation=evaluation, from_pixels=from_pixels)
     camera, errors = load_camera(camera, camera_rate, from_pixels), load_imu(imu)
-    track, parameters = load_track(track), load_preset(preset)
-    if control_rate is not None:
-        parameters = at_control_rate(parameters, control_rate)
+    track, parameters = load_track(track), at_control_rate(load_preset(preset), control_rate)
     default_time = EVALUATION_TIME if evaluation else EPISODE_TIME
     episode_steps = _steps_of(default_time if time_limit is None else time_limit, parameters.control_dt)
     generator = torch.Generator()
@@ -232,13 +220,8 @@ class Physics(mujoco.Physics):
         return self.data.qvel[3:6].copy()
 
     def ideal_imu(self) -> Tensor:
-        """Return what an ideal IMU at the drone's centre measures, (1, 6), as `Simulator.ideal_imu`."""
-        rates, attitude, velocity = (
-            torch.from_numpy(part()) for part in (self.body_rates, self.attitude, self.linear_velocity)
-        )
-        step = self.quadrotor.parameters.physics_dt
-        acceleration = (velocity - self._flight.qvel_before[0, :3]) / step + torch.tensor((0.0, 0.0, GRAVITY))
-        return torch.cat((rates, rotate_inverse(attitude, acceleration))).unsqueeze(0)
+        """Return what an ideal IMU at the drone's centre measures, (1, 6); see `FusedFlight.ideal_imu`."""
+        return self._flight.ideal_imu()
 
     def path(self) -> Tensor:
         """Positions (P + 1, 1, 3) at the start of the control step and after each of its physics steps, m."""
@@ -275,45 +258,24 @@ class Physics(mujoco.Physics):
         self._path = collections.deque((self.position(),), maxlen=steps + 1)
 
 
-class OnboardView:
-    """The nose camera, rendered by dm_control with the drone itself hidden.
-
-    Args:
-        physics: the drone and its hall.
-        camera: the nose camera with which the scene was built.
+def open_nose(physics: Physics, camera: Camera) -> mujoco.Camera:
+    """Open the nose camera with which the scene was built, with the drone itself hidden.
 
     Raises:
         RendererUnavailableError: dm_control has no OpenGL that works here.
     """
-
-    def __init__(self, physics: Physics, camera: Camera) -> None:
-        self._camera = open_camera(physics, camera.height, camera.width, CAMERA_NAME)
-        self._camera.option.geomgroup[:] = 0
-        self._camera.option.geomgroup[HALL_GROUP] = 1
-        self._camera.option.sitegroup[:] = 0
-
-    def image(self) -> np.ndarray:
-        """Return the current image, uint8 (height, width, 3)."""
-        return np.array(self._camera.render())
+    view = open_camera(physics, camera.height, camera.width, CAMERA_NAME)
+    view.option.geomgroup[:] = 0
+    view.option.geomgroup[HALL_GROUP] = 1
+    view.option.sitegroup[:] = 0
+    return view
 
 
 class DroneRace(base.Task):
     """One drone racing as a Control Suite task: the rules of `Race` and the reward of Eq. 1.
 
-    For every episode, the torch generator is seeded with a number drawn from `task.random`.
-
-    Args:
-        track: the track.
-        parameters: the drone.
-        generator: the generator from which `Physics` draws its randomisation; a new one if None.
-        random: seed or `numpy.random.RandomState`.
-        episode_steps: control steps after which an episode is truncated; None for 20 s.
-        evaluation: start at the start pose, at rest, and finish after the track's laps.
-        camera: the nose camera; None for no `pixels`.
-        imu: error model of the IMU; None for no `imu`.
-        weights: reward weights of Eq. 1 of the paper.
-        reward: function of a `Transition` in place of Eq. 1, or `module:function`.
-        vector: function of a `RaceState` that returns the observation `vector`; None for none.
+    For every episode, the torch generator, from which `Physics` draws too, is seeded with a number drawn from
+    `task.random`. Arguments as of `load`; a camera or IMU of None is none.
 
     Attributes:
         body_rate_weight: b₂ of paper Eq. 1, applied to rewards from now on.
@@ -354,7 +316,7 @@ class DroneRace(base.Task):
         self._imu_errors = imu
         self._imu: Imu | None = None
         self._camera = camera
-        self._view: OnboardView | None = None
+        self._view: mujoco.Camera | None = None
         self._frame_interval = 1 if camera is None else frame_interval(camera, 1.0 / parameters.control_dt)
         self._image, self._image_age = np.empty(0), 0  # held image, and its age in control steps
 
@@ -383,13 +345,7 @@ class DroneRace(base.Task):
             ValueError: wrong shape.
         """
         action = np.asarray(action)
-        if action.dtype.kind != "f":
-            raise wrong_action_type(action.dtype)
-        if action.shape != (ACTION_SIZE,):
-            raise ValueError(
-                f"Action of shape {action.shape}: must be ({ACTION_SIZE},): collective "
-                "thrust and body rates x, y, z, each in [-1, 1]."
-            )
+        check_action(action)
         self._invalid_action = not np.isfinite(action).all()
         flown = np.nan_to_num(action.astype(np.float64), nan=0.0, posinf=0.0, neginf=0.0)
         if self._custom_reward is not None:
@@ -433,9 +389,9 @@ class DroneRace(base.Task):
     def _look(self, physics: Physics) -> np.ndarray:
         """Return the held image, after taking a new frame if one is due."""
         assert self._camera is not None, "asked"
-        self._view = self._view or OnboardView(physics, self._camera)
+        self._view = self._view or open_nose(physics, self._camera)
         if self._frame_interval == 1 or self._image_age >= self._frame_interval:
-            self._image, self._image_age = self._view.image(), 0
+            self._image, self._image_age = np.array(self._view.render()), 0
         return self._image.copy()
 
     def get_reward(self, physics: Physics) -> float:

@@ -41,13 +41,7 @@ BACKEND: str | None = _render.BACKEND
 
 
 def open_camera(physics: mujoco.Physics, height: int, width: int, camera: int | str) -> mujoco.Camera:
-    """Make a camera that renders images.
-
-    Args:
-        physics: the simulation to render.
-        height: image height, pixels.
-        width: image width, pixels.
-        camera: number or name in the model.
+    """Make a camera (number or name in the model) that renders images of height × width pixels.
 
     Raises:
         RendererUnavailableError: dm_control has no OpenGL that works here.

@@ -31,7 +31,6 @@ import torch
 from gymnasium.spaces import Box, Dict, Discrete
 
 from dreamer_racing.envs.drone.parameters import QuadrotorParameters
-from dreamer_racing.envs.drone.quadrotor import wrong_action_type
 from dreamer_racing.envs.imu import IMU_SIZE
 from dreamer_racing.envs.race.race import RaceStep
 from dreamer_racing.envs.simulator.chase import ChaseView
@@ -39,11 +38,29 @@ from dreamer_racing.envs.simulator.opengl import RendererUnavailableError
 from dreamer_racing.envs.simulator.rendering import Renderer, make_renderer
 from dreamer_racing.envs.simulator.scene import build_scene
 from dreamer_racing.envs.tracks import Track
-from dreamer_racing.envs.worlds import ACTION_SIZE, RaceWorlds, WorldOptions, check_options
+from dreamer_racing.envs.worlds import ACTION_SIZE, RaceWorlds, WorldOptions, check_action, check_options
 from dreamer_racing.settings import FINITE, check_choice, check_flags, check_setting
 
 RENDER_VIEWS = ("chase", "onboard")
-OBSERVATIONS = ("pixels", "pixels_imu", "pixels_vector", "vector", "state", "both")
+STATE = ("position", "attitude", "linear_velocity", "body_rates", "target_gate")
+OBSERVATIONS = {
+    "pixels": ("pixels",),
+    "pixels_imu": ("pixels", "imu"),
+    "pixels_vector": ("pixels", "vector"),
+    "vector": ("vector",),
+    "state": STATE,
+    "both": ("pixels", *STATE),
+}
+"""Entries of the observation by the argument `observation`; a single one is no dictionary."""
+INFO = {
+    "gates_passed": np.int64,
+    "gate_offset": np.float64,
+    "lap_time": np.float64,
+    "crash": np.int64,
+    "finished": np.bool_,
+    "reward_base": np.float64,
+    "body_rate_norm": np.float64,
+}
 FRAME_SIZE = 256  # width and height of the images of `render`, pixels
 
 Observation = np.ndarray | dict[str, np.ndarray]
@@ -66,16 +83,10 @@ def rows_of(batch: dict[str, Any]) -> list[dict[str, Any]]:
     return [dict(zip(batch, row, strict=True)) for row in zip(*columns, strict=True)]
 
 
-def with_rows(batch: Observation, mask: np.ndarray, rows: Observation) -> Observation:
+def with_rows(batch: Any, mask: np.ndarray, rows: Any) -> Any:
     """Return a copy of the observations of N environments with the masked (N,) bool rows replaced by M new ones."""
     if isinstance(batch, dict):
-        assert isinstance(rows, dict)
-        return {name: _merged(batch[name], mask, rows[name]) for name in batch}
-    assert isinstance(rows, np.ndarray)
-    return _merged(batch, mask, rows)
-
-
-def _merged(batch: np.ndarray, mask: np.ndarray, rows: np.ndarray) -> np.ndarray:
+        return {name: with_rows(values, mask, rows[name]) for name, values in batch.items()}
     merged = batch.copy()  # final observations of episodes are views of the batch
     merged[mask] = rows
     return merged
@@ -84,20 +95,7 @@ def _merged(batch: np.ndarray, mask: np.ndarray, rows: np.ndarray) -> np.ndarray
 class GymWorlds:
     """N worlds with Gymnasium's spaces and `info`, always batched: shared by the single and the vector environments.
 
-    Args:
-        track: name of a built-in track, path to a YAML file, or a `Track`.
-        num_envs: N.
-        observation: `pixels`, `pixels_imu`, `pixels_vector`, `vector`, `state` or `both`.
-        privileged: whether `info` has the state.
-        body_rate_weight: b₂ of paper Eq. 1; that of `RewardWeights` if None.
-        render_mode: `rgb_array` or None.
-        preset: physics preset or parameters.
-        render_view: view of rendered frames: `chase` or `onboard`.
-        worlds: further arguments of `RaceWorlds`, see `WorldOptions`.
-
-    Raises:
-        ValueError: invalid argument; the message says which and what is allowed.
-        TrackError: unknown or invalid track.
+    Its arguments and errors are those of `DroneRaceGymEnv`.
     """
 
     def __init__(
@@ -124,7 +122,7 @@ class GymWorlds:
             raise ValueError(
                 f"device={device!r}: must be cpu, where Gymnasium's arrays are; DroneRacingEnv keeps tensors on a GPU."
             )
-        self.observation = observation
+        self._entries = OBSERVATIONS[observation]
         self.privileged = privileged
         self.renderer_name = worlds.get("renderer", "auto")
         if observation == "pixels_imu":
@@ -134,8 +132,7 @@ class GymWorlds:
             raise ValueError(f"imu={worlds.get('imu')!r} is for observation='pixels_imu', not {observation!r}.")
         if worlds.get("vector") is not None and not observation.endswith("vector"):
             raise ValueError(f"vector= is for observation='vector' or 'pixels_vector', not {observation!r}.")
-        images = observation not in ("vector", "state")
-        self.worlds = RaceWorlds(track, num_envs, preset, from_pixels=images, **worlds)
+        self.worlds = RaceWorlds(track, num_envs, preset, from_pixels="pixels" in self._entries, **worlds)
         self.body_rate_weight = (
             self.worlds.race.weights.body_rate if body_rate_weight is None else float(body_rate_weight)
         )
@@ -155,23 +152,15 @@ class GymWorlds:
 
     def observation_space(self) -> gymnasium.Space:
         """The observation space of one environment."""
-        camera = self.worlds.camera
-        pixels = Box(0, 255, (camera.height, camera.width, 3), np.uint8)
-        if self.observation == "pixels":
-            return pixels
-        if self.observation == "pixels_imu":
-            return Dict({"pixels": pixels, "imu": Box(-np.inf, np.inf, (IMU_SIZE,), np.float32)})
-        vector = Box(-np.inf, np.inf, (self.worlds.vector_size,), np.float32)
-        if self.observation == "vector":
-            return vector
-        if self.observation == "pixels_vector":
-            return Dict({"pixels": pixels, "vector": vector})
-        spaces: dict[str, gymnasium.Space] = {
-            name: Box(-np.inf, np.inf, (size,), np.float32)
-            for name, size in (("position", 3), ("attitude", 4), ("linear_velocity", 3), ("body_rates", 3))
+        sizes = {"imu": IMU_SIZE, "position": 3, "attitude": 4, "linear_velocity": 3, "body_rates": 3}
+        sizes["vector"], camera = self.worlds.vector_size, self.worlds.camera
+        every: dict[str, gymnasium.Space] = {
+            "pixels": Box(0, 255, (camera.height, camera.width, 3), np.uint8),
+            "target_gate": Discrete(self.worlds.track.num_gates),
+            **{name: Box(-np.inf, np.inf, (size,), np.float32) for name, size in sizes.items()},
         }
-        spaces["target_gate"] = Discrete(self.worlds.track.num_gates)
-        return Dict(spaces if self.observation == "state" else {"pixels": pixels, **spaces})
+        spaces = {name: every[name] for name in self._entries}
+        return Dict(spaces) if len(spaces) > 1 else every[self._entries[0]]
 
     def begin(self, mask: np.ndarray | None = None) -> None:
         """Begin episodes in all environments, or in the masked ones (N,) bool.
@@ -195,27 +184,23 @@ class GymWorlds:
         """
         if not self.worlds.has_reset:
             raise gymnasium.error.ResetNeeded("step() before the first reset(): no episode has begun.")
-        actions = np.asarray(actions)
-        if actions.dtype.kind != "f":
-            raise wrong_action_type(actions.dtype)
-        outcome = self.worlds.step(torch.from_numpy(actions.astype(np.float64)))
+        actions = np.array(actions, order="C")  # torch takes no read-only arrays, nor views that run backwards
+        outcome = self.worlds.step(torch.from_numpy(actions))
         return outcome, outcome.reward(self.body_rate_weight).numpy()
 
     def observe(self, mask: np.ndarray | None = None) -> Observation:
         """Return the observations of all environments, or of the M masked ones (N,) bool in order."""
-        rows = slice(None) if mask is None else mask
-        if self.observation == "vector":
-            return self.worlds.observed_vector().numpy()[rows]
-        state = {name: value[rows] for name, value in self.state().items()}
-        if self.observation == "state":
-            return state
-        pixels = self.worlds.render(None if mask is None else torch.from_numpy(mask)).numpy()
-        if self.observation == "pixels_imu":
-            assert self.worlds.imu is not None, "pixels_imu implies an IMU"
-            return {"pixels": pixels, "imu": self.worlds.imu.sample.numpy()[rows]}
-        if self.observation == "pixels_vector":
-            return {"pixels": pixels, "vector": self.worlds.observed_vector().numpy()[rows]}
-        return pixels if self.observation == "pixels" else {"pixels": pixels, **state}
+        worlds, rows = self.worlds, slice(None) if mask is None else mask
+        seen: dict[str, np.ndarray] = {}
+        if "pixels" in self._entries:
+            seen["pixels"] = worlds.render(None if mask is None else torch.from_numpy(mask)).numpy()
+        if "imu" in self._entries and worlds.imu is not None:
+            seen["imu"] = worlds.imu.sample.numpy()[rows]
+        if "vector" in self._entries:
+            seen["vector"] = worlds.observed_vector().numpy()[rows]
+        if "position" in self._entries:
+            seen |= {name: value[rows] for name, value in self.state().items()}
+        return seen if len(seen) > 1 else seen[self._entries[0]]
 
     def state(self) -> dict[str, np.ndarray]:
         """Return the privileged state of all environments; `target_gate` is (N,)."""
@@ -224,21 +209,10 @@ class GymWorlds:
 
     def info(self, outcome: RaceStep | None, begun: np.ndarray | None = None) -> dict[str, Any]:
         """Return `info` as arrays (N,); zeros where an episode has begun (N,) bool, or if there is no outcome."""
-        num_envs = self.worlds.num_envs
-
-        def values(name: str, kind: type) -> np.ndarray:
-            column = np.zeros(num_envs, kind) if outcome is None else getattr(outcome, name).numpy().astype(kind)
-            return column if begun is None else np.where(begun, kind(0), column)
-
-        info: dict[str, Any] = {
-            "gates_passed": values("gates_passed", np.int64),
-            "gate_offset": values("gate_offset", np.float64),
-            "lap_time": values("lap_time", np.float64),
-            "crash": values("crash", np.int64),
-            "finished": values("finished", np.bool_),
-            "reward_base": values("reward_base", np.float64),
-            "body_rate_norm": values("body_rate_norm", np.float64),
-        }
+        info: dict[str, Any] = {}
+        for name, kind in INFO.items():
+            there = np.zeros(self.worlds.num_envs) if outcome is None else getattr(outcome, name).numpy()
+            info[name] = np.where(False if begun is None else begun, 0, there).astype(kind)
         if self.privileged:
             info["privileged"] = self.state()
         return info
@@ -255,7 +229,6 @@ class GymWorlds:
         return self._seen_from_outside() if self._render_view == "chase" else self._seen_on_board()
 
     def _seen_from_outside(self) -> np.ndarray:
-        """Render the drones from chase cameras, in nominal colours."""
         worlds = self.worlds
         if self._chase is None:
             try:
@@ -364,12 +337,9 @@ class DroneRaceGymEnv(gymnasium.Env[Observation, np.ndarray]):
             ResetNeeded: no episode has begun.
             TypeError, ValueError: an action of a wrong type or shape.
         """
-        if np.shape(action) != (ACTION_SIZE,):
-            raise ValueError(
-                f"Action of shape {np.shape(action)}: must be ({ACTION_SIZE},): collective "
-                "thrust and body rates x, y, z, each in [-1, 1]."
-            )
-        outcome, reward = self.race.step(np.asarray(action)[None])
+        action = np.asarray(action)
+        check_action(action)
+        outcome, reward = self.race.step(action[None])
         return (
             row_of(self.race.observe(), 0),
             float(reward[0]),

@@ -24,22 +24,16 @@ ACCELEROMETER_RANGE = 156.9
 class ImuErrors:
     """Error model of an IMU: noise is drawn for each sample, biases for each episode, independently for each axis.
 
-    Attributes:
-        gyro_noise: standard deviation, rad/s.
-        gyro_bias: standard deviation, rad/s.
-        accelerometer_noise: standard deviation, m/s².
-        accelerometer_bias: standard deviation, m/s².
-        delay: age of a sample when it is observed, control steps: 1 if the flight controller is polled in one step and
-            its answer is read in the next.
-
     Raises:
         ValueError: a number is out of its range.
     """
 
-    gyro_noise: float = setting(0.0, NOT_NEGATIVE)
-    gyro_bias: float = setting(0.0, NOT_NEGATIVE)
-    accelerometer_noise: float = setting(0.0, NOT_NEGATIVE)
-    accelerometer_bias: float = setting(0.0, NOT_NEGATIVE)
+    gyro_noise: float = setting(0.0, NOT_NEGATIVE)  # standard deviation, rad/s
+    gyro_bias: float = setting(0.0, NOT_NEGATIVE)  # standard deviation, rad/s
+    accelerometer_noise: float = setting(0.0, NOT_NEGATIVE)  # standard deviation, m/s²
+    accelerometer_bias: float = setting(0.0, NOT_NEGATIVE)  # standard deviation, m/s²
+    # age of a sample when it is observed, control steps: 1 if the flight controller is polled in one step and its
+    # answer is read in the next
     delay: int = setting(0, NOT_NEGATIVE)
 
     def __post_init__(self) -> None:

@@ -71,12 +71,7 @@ VectorFunction: TypeAlias = Callable[[RaceState], Tensor]
 
 
 class RaceStates:
-    """Builds the `RaceState` of N drones.
-
-    Args:
-        race: The race rules and the progress of each episode.
-        vector: The race vector of the same track.
-    """
+    """Builds the `RaceState` of N drones."""
 
     def __init__(self, race: Race, vector: RaceVector) -> None:
         device = race.position.device
@@ -105,7 +100,6 @@ class CustomFunction:
     Args:
         argument: The environment argument it was given as: ``reward`` or ``vector``.
         given: The function, a class with callable instances, or ``module:name`` of either.
-        num_envs: N.
         device: Device of its return values.
 
     Raises:
@@ -117,9 +111,8 @@ class CustomFunction:
         found = found() if isinstance(found, type) else found
         if not callable(found):
             raise ValueError(f"{argument}={quoted(given)}: must be a function, or its name as module:function.")
-        self.name = (
-            f"{argument}={given if isinstance(given, str) else getattr(found, '__name__', type(found).__name__)}"
-        )
+        name = given if isinstance(given, str) else getattr(found, "__name__", type(found).__name__)
+        self.name = f"{argument}={name}"
         self._function, self._num_envs, self._size = found, num_envs, 0
         self._broken = torch.zeros((), dtype=torch.bool, device=device)
 

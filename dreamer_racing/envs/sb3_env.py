@@ -31,19 +31,9 @@ class DroneRaceVecEnv(VecEnv):
     reproducible from the next `reset` on.
 
     Args:
-        track: name of a built-in track, path to a YAML file, or a `Track`.
         num_envs: N.
-        observation: `pixels`, `pixels_imu`, `pixels_vector`, `vector`, `state` or `both`.
-        render_mode: `rgb_array` for frames of 256×256 pixels, or None.
-        privileged: whether `info` has the state.
-        body_rate_weight: b₂ of paper Eq. 1; that of `RewardWeights` if None.
-        preset: physics preset (`easy`, `faithful`, `betaflight`) or parameters.
-        render_view: view of rendered frames: `chase`, the drone from outside, or `onboard`, its nose camera.
-        worlds: further arguments of `RaceWorlds`; see `WorldOptions`.
-
-    Raises:
-        ValueError: invalid argument; the message says which and what is allowed.
-        TrackError: unknown or invalid track.
+        worlds: further arguments of `RaceWorlds`; see `WorldOptions`. All other arguments and the errors are those of
+            `DroneRaceGymEnv`.
 
     Example:
         >>> env = DroneRaceVecEnv("circle", num_envs=16, observation="vector")

@@ -126,7 +126,7 @@ def _compile_open_scene(worlds: RaceWorlds) -> mujoco.MjModel:
 def view(
     track: Any = "kidney", preset: Any = "easy", policy: Callable[[Any], np.ndarray] | None = None, **arguments: Any
 ) -> None:
-    """Open a window on the race of one drone.
+    """Open `dm_control.viewer` on the race of one drone; return when the window is closed.
 
     Args:
         track: name of a built-in track, path to a YAML file, or a `Track`.
@@ -140,23 +140,10 @@ def view(
     check_viewer()
     from dreamer_racing.envs.dm_control_env import load
 
-    launch_viewer(load(track, preset, **arguments), policy)
-
-
-def launch_viewer(env: Any, policy: Callable[[Any], np.ndarray] | None = None) -> None:
-    """Open `dm_control.viewer` on an environment made by `envs.load`; return when the window is closed.
-
-    Args:
-        env: the environment, or a function without arguments that makes it.
-        policy: maps a dm_env `TimeStep` to an action (4,); None hovers.
-
-    Raises:
-        ViewerUnavailableError: no window can be opened here.
-    """
-    check_viewer()
+    # isort: split
     from dm_control import viewer
 
-    viewer.launch(env, policy=policy or hover)
+    viewer.launch(load(track, preset, **arguments), policy=policy or hover)
 
 
 def hover(time_step: Any) -> np.ndarray:
@@ -167,10 +154,7 @@ def hover(time_step: Any) -> np.ndarray:
 
 
 def check_viewer(environment: Mapping[str, str] = os.environ) -> None:
-    """Check that dm_control can open a window, before it tries.
-
-    Args:
-        environment: the environment variables to check.
+    """Check that dm_control can open a window with these environment variables, before it tries.
 
     Raises:
         ViewerUnavailableError: it cannot; the message is one paragraph that names everything that is missing.
@@ -189,11 +173,7 @@ def check_viewer(environment: Mapping[str, str] = os.environ) -> None:
 
 
 def check_window(environment: Mapping[str, str] = os.environ, missing: Sequence[str] = ()) -> None:
-    """Check that a window can be opened, before MuJoCo tries.
-
-    Args:
-        environment: the environment variables to check.
-        missing: further reasons that are already known.
+    """Check that a window can be opened with these environment variables, before MuJoCo tries.
 
     Raises:
         ViewerUnavailableError: it cannot; the message, without a full stop, names everything that is missing.

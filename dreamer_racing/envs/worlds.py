@@ -9,6 +9,7 @@ from collections.abc import Mapping
 from dataclasses import fields, replace
 from typing import Any, TypedDict
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -18,7 +19,6 @@ from dreamer_racing.envs.drone.parameters import (
     load_preset,
     without_randomisation,
 )
-from dreamer_racing.envs.drone.quadrotor import wrong_action_type
 from dreamer_racing.envs.held_frames import FrameHold
 from dreamer_racing.envs.imu import Imu, ImuErrors, load_imu
 from dreamer_racing.envs.own import CustomFunction, RaceState, RaceStates, RewardFunction, Transition, VectorFunction
@@ -110,6 +110,25 @@ def check_options(environment: type, given: Mapping[str, object], options: type)
             )
 
 
+def check_action(action: Tensor | np.ndarray, num_envs: int | None = None) -> None:
+    """Refuse actions that are not floating-point numbers (N, 4), or (4,) without a number of environments.
+
+    Raises:
+        TypeError: wrong type.
+        ValueError: wrong shape.
+    """
+    is_float = action.is_floating_point() if isinstance(action, Tensor) else action.dtype.kind == "f"
+    if not is_float:
+        raise TypeError(f"Action of {action.dtype}: thrust and body rates are floating-point numbers in [-1, 1].")
+    shape = (ACTION_SIZE,) if num_envs is None else (num_envs, ACTION_SIZE)
+    if tuple(action.shape) != shape:
+        where = "" if num_envs is None else f", for {num_envs} environment(s)"
+        raise ValueError(
+            f"Action of shape {tuple(action.shape)}: must be {shape}{where}: collective thrust and body rates x, y, z, "
+            "each in [-1, 1]."
+        )
+
+
 class RaceWorlds:
     """N independent copies of the race, with one drone each.
 
@@ -191,14 +210,14 @@ class RaceWorlds:
         reward: str | RewardFunction | None = None,
         vector: str | VectorFunction | None = None,
     ) -> None:
-        _check_arguments(num_envs, without_none(episode_steps=episode_steps, num_threads=num_threads))
+        _check_counts(num_envs, episode_steps=episode_steps, num_threads=num_threads)
         check_flags(evaluation=evaluation, from_pixels=from_pixels)
         check_device(device)
         self.camera, errors = load_camera(camera, camera_rate, from_pixels), load_imu(imu, from_pixels)
         self._process, self._from_pixels = os.getpid(), from_pixels
         self.track, self.evaluation = load_track(track), evaluation
         self.num_envs = num_envs = int(num_envs)
-        self.parameters = _load_parameters(preset, control_rate)
+        self.parameters = at_control_rate(load_preset(preset), control_rate)
         interval = frame_interval(self.camera, 1.0 / self.parameters.control_dt)
         self._generator = torch.Generator(device)
         self.seed(seed)
@@ -224,14 +243,13 @@ class RaceWorlds:
         self.has_reset = False
 
     def _make_race(self, weights: RewardWeights | None, episode_steps: int | None, miss_radius: float) -> Race:
-        """Make the race rules for training or evaluation."""
         check_numbers({}, {"miss_radius": miss_radius})
         if episode_steps is None:
             episode_steps = round((EVALUATION_TIME if self.evaluation else EPISODE_TIME) / self.parameters.control_dt)
         return Race(
             self.track,
             self.num_envs,
-            weights=weights or RewardWeights(),
+            weights=weights,
             episode_steps=episode_steps,
             laps=self.track.laps if self.evaluation else None,
             control_dt=self.parameters.control_dt,
@@ -261,14 +279,8 @@ class RaceWorlds:
 
     def _make_starts(self, beyond_gate: float, at_gate: float, noise: float, on_line: float) -> StartSampler:
         """Make the sampler of start poses, and plan the racing line if episodes begin on it."""
-        shares = {"start_beyond_gate": beyond_gate, "start_at_gate": at_gate, "start_on_line": on_line}
-        check_numbers({}, {**shares, "start_noise": noise})
-        if not 0.0 <= on_line <= 1.0:
-            raise ValueError(f"start_on_line={on_line}: must be a share of episodes, from 0 to 1.")
         on_line = 0.0 if self.evaluation else on_line
-        line = None
-        if on_line:
-            line = plan_racing_line(self.track, without_randomisation(self.parameters), START_LINE)
+        nominal = without_randomisation(self.parameters)
         return StartSampler(
             self.track,
             self._generator,
@@ -276,9 +288,9 @@ class RaceWorlds:
             self.dtype,
             beyond_gate,
             noise,
-            on_line=on_line,
-            line=line,
-            at_gate=at_gate,
+            on_line,
+            plan_racing_line(self.track, nominal, START_LINE) if on_line else None,
+            at_gate,
         )
 
     @property
@@ -352,14 +364,8 @@ class RaceWorlds:
         self._check_process()
         if not self.has_reset:
             raise RuntimeError("Step before the first reset: call reset() to begin episodes.")
-        if not action.is_floating_point():
-            raise wrong_action_type(action.dtype)
+        check_action(action, self.num_envs)
         action = action.detach()  # delayed commands would otherwise keep all previous autograd graphs
-        if action.shape != (self.num_envs, ACTION_SIZE):
-            raise ValueError(
-                f"Action of shape {tuple(action.shape)}: must be ({self.num_envs}, {ACTION_SIZE}), for "
-                f"{self.num_envs} environment(s): collective thrust and body rates x, y, z, each in [-1, 1]."
-            )
         if action.device != self.device:
             raise ValueError(f"Action on {action.device}: must be on {self.device}, like these worlds.")
         outcome = self._fly(action) if self.device.type != "cuda" else self._replay(action)
@@ -540,25 +546,8 @@ class RaceWorlds:
             self.simulator.close()
 
 
-def _load_parameters(preset: str | QuadrotorParameters, control_rate: float | None) -> QuadrotorParameters:
-    """Return the drone parameters of a preset, at a control rate if one is given."""
-    parameters = load_preset(preset)
-    if control_rate is None:
-        return parameters
-    check_numbers({}, {"control_rate": control_rate})
-    return at_control_rate(parameters, control_rate)
-
-
-def _check_arguments(num_envs: int, whole: Mapping[str, object]) -> None:
-    """Refuse arguments of a wrong type early, with a clear message.
-
-    Args:
-        num_envs: N.
-        whole: further arguments that must be whole numbers, by name.
-
-    Raises:
-        ValueError: the message names the argument, its value and what it must be.
-    """
-    check_numbers({"num_envs": num_envs, **whole}, {})
+def _check_counts(num_envs: int, **others: int | None) -> None:
+    """Refuse numbers that are not whole, where they are given, and no worlds."""
+    check_numbers({"num_envs": num_envs, **without_none(**others)}, {})
     if num_envs < 1:
         raise ValueError(f"num_envs={num_envs}: at least one world is needed.")

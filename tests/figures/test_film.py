@@ -345,9 +345,9 @@ def test_a_flight_is_filmed_up_to_its_first_non_finite_state() -> None:
 
 
 def test_without_opengl_it_says_what_is_missing(monkeypatch: pytest.MonkeyPatch) -> None:
-    def missing(backend: str) -> None:
+    def missing(backend: str, *_: object) -> None:
         raise RendererUnavailableError(f"{backend} needs a library, which is not installed.")
 
-    monkeypatch.setattr(chase, "require_library", missing)
+    monkeypatch.setattr(chase, "open_scene", missing)
     with pytest.raises(RendererUnavailableError, match=r"Only OpenGL can .* egl needs a .* osmesa needs a library"):
         view_of_circle()

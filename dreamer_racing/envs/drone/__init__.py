@@ -1,1 +1,1 @@
-"""The vehicle: its parameters, rotations, and one step of its motion."""
+"""The vehicle: its parameters, and the state of its flight controller and motors."""

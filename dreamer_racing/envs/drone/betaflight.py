@@ -11,14 +11,13 @@ not documented.
 """
 
 import math
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 
 from dreamer_racing.settings import (
     NOT_NEGATIVE,
     POSITIVE,
     SHARE,
     Range,
-    check_numbers,
     check_settings,
     check_three,
     setting,
@@ -49,10 +48,6 @@ class BetaflightParameters:
 
     Raises:
         ValueError: the message gives the value, and what is allowed.
-
-    Example:
-        >>> BetaflightParameters(p=(50, 52, 30)).p
-        (50, 52, 30)
     """
 
     p: tuple[float, float, float] = (45.0, 47.0, 30.0)  # [doc]; yaw [set], as it oscillates with its default, 45
@@ -85,8 +80,6 @@ class BetaflightParameters:
 
     def __post_init__(self) -> None:
         prefix = "BetaflightParameters: "
-        plain = [field.name for field in fields(self) if field.type is float]
-        check_numbers({}, {prefix + name: getattr(self, name) for name in plain})
         check_settings(self, prefix)
         for name in ("p", "i", "d", "d_max", "sum_limit"):
             check_three(prefix + name, getattr(self, name), NOT_NEGATIVE)

@@ -7,18 +7,13 @@ compared.
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, is_dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
+
+import yaml
 
 from dreamer_racing.envs.drone.betaflight import BetaflightParameters
-from dreamer_racing.envs.drone.variations import (
-    SUFFIXES,
-    apply_changes,
-    field_differences,
-    read_variation,
-    write_variation,
-)
 from dreamer_racing.settings import (
     NOT_NEGATIVE,
     POSITIVE,
@@ -26,11 +21,13 @@ from dreamer_racing.settings import (
     check_numbers,
     check_settings,
     check_three,
+    is_number,
     quoted,
     setting,
     suggestion,
 )
 
+T = TypeVar("T")
 GRAVITY = 9.81  # m/s²
 INTEGRATORS = ("Euler", "RK4")
 """MuJoCo's names of the allowed integrators: `RigidStep` corrects Euler to second order; RK4 needs no correction."""
@@ -98,12 +95,10 @@ class QuadrotorParameters:
 
     def __post_init__(self) -> None:
         prefix, three = "QuadrotorParameters: ", {"inertia": POSITIVE, "drag": NOT_NEGATIVE, "body_rate_max": POSITIVE}
-        plain = [field.name for field in fields(self) if field.type is float]
-        check_numbers({}, {prefix + name: getattr(self, name) for name in plain})
         check_settings(self, prefix)
         for name, allowed in three.items():
             check_three(prefix + name, getattr(self, name), allowed)
-        if not self.motor_time_constant > 0.0:
+        if not (is_number(self.motor_time_constant) and self.motor_time_constant > 0.0):
             raise ValueError(f"{prefix}motor_time_constant={self.motor_time_constant}: must be above 0.")
         if self.integrator not in INTEGRATORS:
             there = " or ".join(INTEGRATORS)
@@ -167,8 +162,21 @@ PRESETS: dict[str, QuadrotorParameters] = {
 }
 
 
+SUFFIXES = (".yaml", ".yml")
+"""File name suffixes of drone files."""
+
+
 def load_preset(preset: str | QuadrotorParameters) -> QuadrotorParameters:
     """Return the parameters of a named preset (`easy`, `faithful`, `betaflight`), a drone file, or those given.
+
+    A drone file, for example of a measured drone, varies a preset, but for the widths of its randomisation::
+
+        preset: betaflight
+        parameters:                 # fields of `QuadrotorParameters`, in SI units
+          mass: 0.62
+          betaflight:               # fields of `BetaflightParameters`
+            p: [45, 47, 30]
+        about: {}                   # sources of the numbers; not read
 
     Raises:
         ValueError: unknown name, or an invalid drone file.
@@ -182,15 +190,38 @@ def load_preset(preset: str | QuadrotorParameters) -> QuadrotorParameters:
 
 
 def _read_drone(path: Path) -> QuadrotorParameters:
-    """Read a drone file; see `variations`."""
-    base, changes = read_variation(path)
+    if not path.is_file():
+        raise ValueError(f"preset={path}: there is no such file.")
+    try:
+        content = yaml.safe_load(path.read_text(encoding="utf-8"))
+    except (yaml.YAMLError, UnicodeDecodeError) as error:
+        raise ValueError(f"{path} is not valid YAML: {error}") from error
+    changes = content.get("parameters", {}) if isinstance(content, dict) else None
+    if not isinstance(changes, dict):
+        raise ValueError(f"{path} is not a drone file: it needs preset: (a name) and parameters: (fields and values).")
+    base = content.get("preset")
     if base not in PRESETS:
         there = ", ".join(sorted(PRESETS))
         raise ValueError(f"{path}: preset: {quoted(base)} is not one of {there}{suggestion(base, PRESETS)}.")
     try:
-        return apply_changes(PRESETS[base], changes)
+        return _with_changes(PRESETS[base], changes)
     except (ValueError, TypeError) as error:
         raise ValueError(f"{path}: {error}") from error
+
+
+def _with_changes(base: T, changes: Mapping[str, Any]) -> T:
+    """Return a copy of a dataclass with changed fields; lists become tuples, and mappings change inner dataclasses."""
+    names = sorted(set(vars(base)) - {"randomisation"})
+    values: dict[str, Any] = {}
+    for name, value in changes.items():
+        if name not in names:
+            raise ValueError(f"there is no parameter {quoted(name)}{suggestion(name, names)}: {', '.join(names)}.")
+        before = getattr(base, name)
+        if isinstance(value, dict) and not is_dataclass(before):
+            raise ValueError(f"{name}={quoted(value)}: {name} has no fields.")
+        inner = isinstance(value, dict)
+        values[name] = _with_changes(before, value) if inner else tuple(value) if isinstance(value, list) else value
+    return replace(base, **values)  # type: ignore[type-var]  # a dataclass, of any kind
 
 
 def save_drone(path: Path, drone: QuadrotorParameters, about: Mapping[str, Any]) -> None:
@@ -202,23 +233,35 @@ def save_drone(path: Path, drone: QuadrotorParameters, about: Mapping[str, Any])
         about: Sources of its numbers, plain values.
     """
     base = "faithful" if drone.betaflight is None else "betaflight"
-    write_variation(path, base, field_differences(PRESETS[base], drone), about)
+    content = {"preset": base, "parameters": _differences(PRESETS[base], drone), "about": dict(about)}
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_text(yaml.safe_dump(content, sort_keys=False, default_flow_style=None, width=100), encoding="utf-8")
+
+
+def _differences(base: Any, changed: Any) -> dict[str, Any]:
+    """Return the fields in which one dataclass differs from another, as plain values."""
+    found: dict[str, Any] = {}
+    for name, now in vars(changed).items():
+        before = getattr(base, name)
+        if before != now and name != "randomisation":
+            inner = is_dataclass(before) and is_dataclass(now)
+            found[name] = _differences(before, now) if inner else list(now) if isinstance(now, tuple) else now
+    return found
 
 
 MIN_CONTROL_RATE = 10.0
 """Lowest control rate, Hz, at which a drone at 18 m/s flies 1.8 m per step [choice]."""
 
 
-def at_control_rate(parameters: QuadrotorParameters, rate: float) -> QuadrotorParameters:
-    """Return the same drone at another control rate.
-
-    Args:
-        parameters: the drone.
-        rate: Hz, at least ``MIN_CONTROL_RATE``; a control step must be a whole number of physics steps.
+def at_control_rate(parameters: QuadrotorParameters, rate: float | None) -> QuadrotorParameters:
+    """Return the same drone at another control rate in Hz, or unchanged if None.
 
     Raises:
-        ValueError: it is not, or the rate is too low.
+        ValueError: the rate is too low, or a control step would not be a whole number of physics steps.
     """
+    if rate is None:
+        return parameters
+    check_numbers({}, {"control_rate": rate})
     if not rate >= MIN_CONTROL_RATE:
         raise ValueError(
             f"control_rate={rate} Hz: must be at least {MIN_CONTROL_RATE:g}: a control step may pass only one gate."

@@ -70,20 +70,10 @@ class RateLoop:
 
     Args:
         parameters: the drone, whose `betaflight` is set.
-        num_drones: N.
-        device: device of the tensors.
-        dtype: floating-point type.
 
     Attributes:
         state: (N, rows of `Row`, 3) their state, updated in place.
         drone_parameters: (N, rows of `DroneParameter`, 3) their individual parameters, updated in place.
-
-    Example:
-        >>> from dataclasses import replace
-        >>> from dreamer_racing.envs.drone.parameters import PRESETS
-        >>> loop = RateLoop(PRESETS["betaflight"], num_drones=1)
-        >>> loop.motor_commands(torch.tensor([[5.886, 0.0, 0.0, 0.0]]), torch.zeros(1, 3)).round(decimals=3)
-        tensor([[0.6060, 0.6060, 0.6060, 0.6060]], dtype=torch.float64)
     """
 
     def __init__(

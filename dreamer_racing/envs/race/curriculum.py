@@ -18,23 +18,14 @@ from torchrl.envs.transforms import Transform
 
 @dataclass
 class BodyRateSchedule:
-    """Schedule of b₂, the weight of the body-rate penalty in paper Eq. 1, see `BodyRateCurriculum`.
+    """Schedule of b₂, the weight of the body-rate penalty in paper Eq. 1, see `BodyRateCurriculum`."""
 
-    Attributes:
-        threshold: mean return above which b₂ grows.
-        increment: step by which b₂ grows, 1/(rad/s).
-        maximum: upper limit of b₂, 1/(rad/s).
-        window: number of episodes in the mean; b₂ does not grow before there are as many.
-        cooldown: minimum number of episodes between two increments.
-        relabel: whether rewards of replayed steps are recomputed with the current b₂.
-    """
-
-    threshold: float = 50.0
-    increment: float = 0.001
-    maximum: float = 0.01
-    window: int = 100
-    cooldown: int = 100
-    relabel: bool = True
+    threshold: float = 50.0  # mean return above which b₂ grows
+    increment: float = 0.001  # step by which b₂ grows, 1/(rad/s)
+    maximum: float = 0.01  # upper limit of b₂, 1/(rad/s)
+    window: int = 100  # number of episodes in the mean; b₂ does not grow before there are as many
+    cooldown: int = 100  # minimum number of episodes between two increments
+    relabel: bool = True  # whether rewards of replayed steps are recomputed with the current b₂
 
 
 class BodyRateCurriculum:
@@ -83,27 +74,18 @@ class BodyRateCurriculum:
         return {"curriculum/body_rate_weight": self.body_rate_weight}
 
     def update(self, episode_returns: Tensor | Sequence[float]) -> float:
-        """Update b₂ with finished training episodes, one by one in the given order.
-
-        Args:
-            episode_returns: undiscounted returns, ``(E,)``.
-
-        Returns:
-            b₂ after the last of them.
-        """
+        """Update b₂ with the undiscounted returns ``(E,)`` of finished training episodes, in order; return b₂."""
+        schedule = self.schedule
         values = episode_returns.flatten().tolist() if isinstance(episode_returns, Tensor) else episode_returns
         for value in values:
             self._returns.append(float(value))
             self._since_growth += 1
-            if self._may_grow() and sum(self._returns) / len(self._returns) > self.schedule.threshold:
+            may_grow = len(self._returns) == schedule.window and self._since_growth >= schedule.cooldown
+            races_well = sum(self._returns) > schedule.threshold * len(self._returns)
+            if may_grow and races_well and self.body_rate_weight < schedule.maximum:
                 self._growths += 1
                 self._since_growth = 0
         return self.body_rate_weight
-
-    def _may_grow(self) -> bool:
-        window_is_full = len(self._returns) == self._returns.maxlen
-        cooled_down = self._since_growth >= self.schedule.cooldown
-        return window_is_full and cooled_down and self.body_rate_weight < self.schedule.maximum
 
     def state_dict(self) -> dict[str, Any]:
         """Return everything that a checkpoint needs."""
@@ -123,13 +105,6 @@ class RelabelReward(Transform):
     """Replay transform that recomputes rewards with the current b₂: ``reward_base − b₂ · body_rate_norm``.
 
     Without it, sampled rewards have the b₂ at the time of their collection.
-
-    Args:
-        curriculum: source of b₂, read at each sample.
-
-    Example:
-        >>> transform = RelabelReward(BodyRateCurriculum())
-        >>> # make_replay(..., transform=transform)
     """
 
     def __init__(self, curriculum: BodyRateCurriculum) -> None:

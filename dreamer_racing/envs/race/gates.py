@@ -51,12 +51,9 @@ _PARALLEL = 1e-30  # m: replaces a displacement of zero in divisions
 class GateSweep(NamedTuple):
     """Gate passes and first crash of each drone in one control step."""
 
-    passes: torch.Tensor
-    """(N,) int64: gates passed before any crash: 1 for the target, 2 for the target and the next gate."""
-    offset: torch.Tensor
-    """(N,) distance in the target's plane between its centre and the point of the pass, m; 0 if not passed."""
-    crash: torch.Tensor
-    """(N,) int64: the ``CrashCause`` of the first crash, 0 where there was none."""
+    passes: torch.Tensor  # (N,) int64: gates passed before any crash: 1 for the target, 2 for it and the next gate
+    offset: torch.Tensor  # (N,) m, from the target's centre to the point of the pass, in its plane; 0 if not passed
+    crash: torch.Tensor  # (N,) int64: the `CrashCause` of the first crash, 0 where there was none
 
 
 class _Crossings(NamedTuple):
@@ -78,21 +75,12 @@ class GateSweeper:
 
     Args:
         track: the track; only its race gates, shape and bounding box matter.
-        device: device of the paths.
-        dtype: floating-point type of the paths.
         miss_radius: crossing the target gate's plane outside its frame and less than this from its centre is a crash,
             m; 0 allows it.
         reach: the farthest that a drone flies in a control step, m.
 
     Raises:
         ValueError: the miss radius is within the frame.
-
-    Example:
-        >>> from dreamer_racing.envs.tracks import load_track
-        >>> sweeper = GateSweeper(load_track("circle"))
-        >>> path = torch.tensor([[4.0, -0.1, 1.35], [4.0, 0.1, 1.35]]).unsqueeze(1)  # (P + 1, N, 3)
-        >>> sweeper(path, torch.tensor([0])).passes
-        tensor([1])
     """
 
     def __init__(
@@ -162,9 +150,6 @@ class GateSweeper:
         Args:
             path: positions at the start and after each physics step, (P + 1, N, 3), m.
             target_gate: index of the next gate of each drone, (N,) int64.
-
-        Returns:
-            The passes and the first crash of each drone.
         """
         num_drones = target_gate.shape[0]
         assert path.shape[1:] == (num_drones, 3), f"path must be (P + 1, {num_drones}, 3), got {tuple(path.shape)}"
@@ -264,11 +249,7 @@ class GateSweeper:
         be tested against the opening.
         """
         forward, left, up = self._to_gate_axes(position)
-        sides = (
-            _within(forward, self._half_depth),
-            _within(left, self._half_outer),
-            _within(up, self._half_outer),
-        )
+        sides = _within(forward, self._half_depth), _within(left, self._half_outer), _within(up, self._half_outer)
         enter = torch.stack([side[0] for side in sides]).amax(0).clamp(min=0)  # (G, P, N)
         leave = torch.stack([side[1] for side in sides]).amin(0).clamp(max=1)
         starts_outside, ends_outside = (

@@ -25,31 +25,18 @@ from dreamer_racing.envs.tracks import Track, load_track
 
 @dataclass(frozen=True)
 class PilotGains:
-    """Feedback gains and limits of the pilot.
+    """Feedback gains and limits of the pilot."""
 
-    Args:
-        position: 1/s², acceleration per metre of lateral error.
-        velocity: 1/s, acceleration per m/s of lateral velocity error.
-        progress: 1/s, gain of the speed error along the line.
-        attitude: 1/s², angular acceleration per radian of thrust axis error.
-        body_rate: 1/s, angular acceleration per rad/s of rate error.
-        yaw: 1/s, yaw rate per radian of heading error.
-        correction_max: m/s², maximum acceleration from lateral errors.
-        progress_max: m/s², maximum acceleration from speed errors along the line.
-        look_ahead: s, the nose points to the line's position this much later.
-        adaptation: 1/s, rate at which the thrust scale estimate follows the measurement.
-    """
-
-    position: float = 14.0
-    velocity: float = 6.0
-    progress: float = 3.0
-    attitude: float = 120.0
-    body_rate: float = 17.0
-    yaw: float = 5.0
-    correction_max: float = 10.0
-    progress_max: float = 8.0
-    look_ahead: float = 0.5
-    adaptation: float = 1.0
+    position: float = 14.0  # 1/s², acceleration per metre of lateral error
+    velocity: float = 6.0  # 1/s, acceleration per m/s of lateral velocity error
+    progress: float = 3.0  # 1/s, gain of the speed error along the line
+    attitude: float = 120.0  # 1/s², angular acceleration per radian of thrust axis error
+    body_rate: float = 17.0  # 1/s, angular acceleration per rad/s of rate error
+    yaw: float = 5.0  # 1/s, yaw rate per radian of heading error
+    correction_max: float = 10.0  # m/s², maximum acceleration from lateral errors
+    progress_max: float = 8.0  # m/s², maximum acceleration from speed errors along the line
+    look_ahead: float = 0.5  # s, the nose points to the line's position this much later
+    adaptation: float = 1.0  # 1/s, rate at which the thrust scale estimate follows the measurement
 
 
 class ScriptedPilot:
@@ -63,14 +50,6 @@ class ScriptedPilot:
         parameters: preset or parameters of the drone; the pilot uses only the nominal ones, without randomisation.
         limits: limits of the line; its `speed` sets the aggressiveness. None for the defaults.
         gains: the feedback gains; None for the defaults.
-        device: device of the states.
-        dtype: floating-point type of the states and actions.
-
-    Example:
-        >>> pilot = ScriptedPilot("circle")
-        >>> level, still = torch.tensor([[1.0, 0.0, 0.0, 0.0]]), torch.zeros(1, 3)
-        >>> pilot.act(torch.tensor([[4.0, -2.5, 1.35]]), level, still, still, torch.tensor([0])).shape
-        torch.Size([1, 4])
     """
 
     WINDOW = 0.25  # s: the line is searched from this long before the last gate to this long after the target gate
@@ -264,9 +243,6 @@ class PilotPolicy(TensorDictModuleBase):
     """The pilot as a policy of `DroneRacingEnv`: reads `("privileged", ...)`, writes `action`.
 
     It needs no `is_init`: the pilot detects resets itself.
-
-    Args:
-        pilot: the pilot.
 
     Example:
         >>> from dreamer_racing.envs import DroneRacingEnv

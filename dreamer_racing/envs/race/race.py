@@ -85,14 +85,9 @@ class Race:
     counts (gate, lap time), but the reward is the collision's and the episode is terminated.
 
     Args:
-        track: the track.
-        num_envs: number of drones N.
         weights: the weights of Eq. 1.
         episode_steps: control steps after which an episode is truncated; None for 20 s.
         laps: laps after which an episode is truncated as finished (evaluation); None to fly until time is up.
-        control_dt: duration of a control step, s.
-        device: device of all tensors.
-        dtype: floating-point type of positions and rewards.
         miss_radius: see `GateSweeper`.
 
     Example:
@@ -143,13 +138,7 @@ class Race:
         self.position = torch.zeros(num_envs, 3, dtype=dtype, device=device)  # (N, 3) at the last control step, m
 
     def begin(self, mask: Tensor, position: Tensor, target_gate: Tensor) -> None:
-        """Begin an episode for the masked drones.
-
-        Args:
-            mask: drones whose episode begins, (N,) bool.
-            position: their start positions, (N, 3), m; read only where masked.
-            target_gate: the first gate to pass, (N,) int64; read only where masked.
-        """
+        """Begin episodes where masked (N,) bool, at positions (N, 3) in m, with the first gates to pass (N,) int64."""
         self.position.copy_(torch.where(mask.unsqueeze(-1), position.to(self._dtype), self.position))
         self.target_gate.copy_(torch.where(mask, target_gate, self.target_gate))
         self.gates_passed.masked_fill_(mask, 0)
@@ -170,14 +159,9 @@ class Race:
         path, body_rates = path.to(self._dtype), body_rates.to(self._dtype)
         passes, gate_offset, crash = self._judge(path, body_rates, invalid_action)
         crashed = crash != CrashCause.NONE
+        gate = self._gate_positions[self.target_gate]
         reward_base, body_rate_norm = race_reward(
-            self.weights,
-            self._gate_positions[self.target_gate],
-            self.position,
-            path[-1],
-            body_rates,
-            passes,
-            crashed,
+            self.weights, gate, self.position, path[-1], body_rates, passes, crashed
         )
         lap_complete, lap_time = self._advance(passes, path[-1])
         if self.laps is None:
@@ -233,19 +217,15 @@ class Race:
 class RewardWeights:
     """The weights of Eq. 1.
 
-    Args:
-        progress: b₁, reward per metre of progress to the target gate. Reference: paper, Table of reward parameters.
-        body_rate: b₂, penalty per rad/s of body rate; a curriculum raises it to 0.01.
-        gate: reward per gate passed, in place of the progress reward in that control step.
-        collision: reward of a control step that ends in a crash, in place of all other terms.
-
     Raises:
         ValueError: a weight is not finite.
     """
 
+    # b₁, reward per metre of progress to the target gate. Reference: paper, Table of reward parameters.
     progress: float = setting(1.0, FINITE)
-    body_rate: float = setting(0.0, FINITE)
-    gate: float = setting(10.0, FINITE)
+    body_rate: float = setting(0.0, FINITE)  # b₂, penalty per rad/s of body rate; a curriculum raises it to 0.01
+    gate: float = setting(10.0, FINITE)  # reward per gate passed, in place of the progress reward in that control step
+    # reward of a control step that ends in a crash, in place of all other terms
     collision: float = setting(-4.0, FINITE)
 
     def __post_init__(self) -> None:
@@ -269,15 +249,14 @@ def race_reward(
     Args:
         weights: the weights of Eq. 1; ``body_rate`` is not applied here.
         gate_position: centre of each drone's target gate, (N, 3), m.
-        previous_position: position at the last control step, (N, 3), m.
-        position: position now, (N, 3), m.
-        body_rates: angular velocity, (N, 3), rad/s.
+        previous_position: at the last control step, (N, 3), m.
+        position: (N, 3), m.
+        body_rates: (N, 3), rad/s.
         passes: gates passed in this step, each of which is rewarded, (N,) int64.
-        crashed: the drone crashed in this step, (N,) bool.
+        crashed: (N,) bool.
 
     Returns:
-        ``reward_base`` (N,), the reward at b₂ = 0, and ``body_rate_norm`` (N,), rad/s: ‖ω‖, but 0 on a pass or crash,
-        where Eq. 1 has no rate term.
+        ``reward_base`` and ``body_rate_norm``, (N,) each, as in `RaceStep`.
 
     Reference: paper, Eq. 1.
     """
@@ -292,19 +271,7 @@ def race_reward(
 class RaceVector:
     """Computes the race vector of N drones, with the entries listed in ``RACE_VECTOR_ENTRIES``.
 
-    Every entry is of order one [choice of divisors].
-
-    Args:
-        track: The track.
-        device: Device of the tensors.
-        dtype: Floating-point type of the drones' state.
-
-    Example:
-        >>> from dreamer_racing.envs.worlds import RaceWorlds
-        >>> worlds = RaceWorlds("circle", num_envs=2, from_pixels=False)
-        >>> worlds.reset()
-        >>> worlds.vector().shape
-        torch.Size([2, 21])
+    Every entry is of order one [choice of divisors]. ``dtype`` is the floating-point type of the drones' state.
     """
 
     def __init__(self, track: Track, device: torch.device | str = "cpu", dtype: torch.dtype = torch.float64) -> None:
@@ -313,12 +280,7 @@ class RaceVector:
         self._up = torch.tensor([0.0, 0.0, 1.0], device=device, dtype=dtype)
 
     def __call__(self, state: DroneState, target_gate: Tensor) -> Tensor:
-        """Return the vectors, float32 ``(N, 21)``.
-
-        Args:
-            state: State of the drones.
-            target_gate: The gate to pass next, int64 ``(N,)``.
-        """
+        """Return the vectors, float32 ``(N, 21)``, for the gates to pass next, int64 ``(N,)``."""
         gates = torch.stack((target_gate, (target_gate + 1) % len(self._positions)), 1)  # (N, 2)
         to_gate = (self._positions[gates] - state.position.unsqueeze(1)) / DISTANCE  # (N, 2, 3)
         world = torch.cat(

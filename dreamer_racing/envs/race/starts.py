@@ -14,20 +14,17 @@ from dreamer_racing.envs.drone.rotation import from_roll_pitch_yaw, rotate, rota
 from dreamer_racing.envs.race.racing_line import RacingLine
 from dreamer_racing.envs.tracks import Track
 from dreamer_racing.envs.tracks.validation import START_CLEARANCE, flyable_box
+from dreamer_racing.settings import SHARE, check_numbers, check_setting
 
 
 @dataclasses.dataclass(frozen=True)
 class StartPose:
     """Poses, velocities and target gates with which N episodes begin."""
 
-    position: torch.Tensor
-    """(N, 3) m."""
-    attitude: torch.Tensor
-    """(N, 4) unit quaternion wxyz, body → world."""
-    linear_velocity: torch.Tensor
-    """(N, 3) in the world, m/s."""
-    target_gate: torch.Tensor
-    """(N,) int64: the first gate to pass."""
+    position: torch.Tensor  # (N, 3) m
+    attitude: torch.Tensor  # (N, 4) unit quaternion wxyz, body → world
+    linear_velocity: torch.Tensor  # (N, 3) in the world, m/s
+    target_gate: torch.Tensor  # (N,) int64: the first gate to pass
 
 
 class StartSampler:
@@ -52,10 +49,7 @@ class StartSampler:
     "DeepMimic", Section 6.2 (reference state initialisation).
 
     Args:
-        track: the track.
         generator: source of randomness, on the sampler's device; None for torch's own.
-        device: device of the poses.
-        dtype: floating-point type of the poses.
         beyond_gate: share of the training episodes not on the line that begin beyond a gate.
         at_gate: share of the remaining training episodes that begin before a gate.
         on_line: share of training episodes that begin on ``line``.
@@ -63,14 +57,8 @@ class StartSampler:
         start_noise: noise of evaluation starts, as a multiple of the noise of training.
 
     Raises:
-        ValueError: ``beyond_gate``, ``at_gate`` or ``on_line`` is not a share, there is no line, or ``start_noise`` is
-            negative or could carry a drone across the plane of its first gate.
-
-    Example:
-        >>> from dreamer_racing.envs.tracks import load_track
-        >>> pose = StartSampler(load_track("circle")).sample(2, evaluation=True)
-        >>> pose.position[0]
-        tensor([ 4.0000, -2.5000,  1.3500])
+        ValueError: a share is none, there is no line, or ``start_noise`` is negative or could carry a drone across the
+            plane of its first gate.
     """
 
     POSITION_NOISE = (0.5, 0.5, 0.3)  # m
@@ -96,8 +84,8 @@ class StartSampler:
         line: RacingLine | None = None,
         at_gate: float = 0.5,
     ):
-        _check_share("beyond_gate", beyond_gate)
-        _check_share("at_gate", at_gate)
+        check_setting("start_beyond_gate", beyond_gate, SHARE)
+        check_setting("start_at_gate", at_gate, SHARE)
         _check_start_noise(start_noise, track)
         self._beyond_gate, self._at_gate = beyond_gate, at_gate
         self._line = line.to(device, dtype) if line is not None else None
@@ -120,12 +108,7 @@ class StartSampler:
         self._attitude_noise = torch.tensor(self.ATTITUDE_NOISE_DEGREES, device=device, dtype=dtype).deg2rad()
 
     def sample(self, num: int, evaluation: bool = False) -> StartPose:
-        """Draw start poses.
-
-        Args:
-            num: number of poses N.
-            evaluation: whether to start at the track's start pose; without noise this draws no random numbers.
-        """
+        """Draw N start poses; those of evaluation without noise draw no random numbers."""
         if evaluation:
             return self._start(num)
         pose = self._training_start(num)
@@ -138,9 +121,9 @@ class StartSampler:
 
     @on_line.setter
     def on_line(self, share: float) -> None:
-        _check_share("on_line", share)
+        check_setting("start_on_line", share, SHARE)
         if share and self._line is None:
-            raise ValueError(f"on_line={share}: needs a racing line, line=plan_racing_line(track, parameters).")
+            raise ValueError(f"start_on_line={share}: needs a racing line, line=plan_racing_line(track, parameters).")
         self._on_line = share
 
     def _start(self, num: int) -> StartPose:
@@ -233,15 +216,9 @@ class StartSampler:
     def _disturb(
         self, origin: torch.Tensor, yaw: torch.Tensor, noise: torch.Tensor
     ) -> tuple[torch.Tensor, torch.Tensor]:
-        """Add noise (N, 6) to level poses, in units of the training noise, and clip them to the free box.
+        """Add noise (N, 6) to level poses at (N, 3) with yaws (N,); return clipped positions and attitudes (N, 4).
 
-        Args:
-            origin: (N, 3) m.
-            yaw: (N,) rad.
-            noise: forward, left, up, roll, pitch, yaw.
-
-        Returns:
-            Positions (N, 3) and attitudes (N, 4).
+        The noise is of forward, left, up, roll, pitch and yaw, in units of the training noise.
         """
         level = torch.zeros_like(yaw)
         position = origin + rotate(from_roll_pitch_yaw(level, level, yaw), noise[:, :3] * self._position_noise)
@@ -250,14 +227,9 @@ class StartSampler:
         return position, from_roll_pitch_yaw(roll, pitch, yaw + yaw_noise)
 
 
-def _check_share(name: str, share: float) -> None:
-    """Refuse a share outside [0, 1]."""
-    if not 0.0 <= share <= 1.0:
-        raise ValueError(f"{name}={share}: must be a share of episodes, from 0 to 1.")
-
-
 def _check_start_noise(start_noise: float, track: Track) -> None:
     """Refuse noise that could carry a drone from the start across the plane of the first gate."""
+    check_numbers({}, {"start_noise": start_noise})
     gate, start = track.gates[0], track.start_position
     ahead = sum((a - b) * c for a, b, c in zip(gate.position, start, gate.forward, strict=True))
     most = ahead / math.hypot(*StartSampler.POSITION_NOISE[:2])

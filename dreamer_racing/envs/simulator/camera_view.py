@@ -15,13 +15,7 @@ from dreamer_racing.envs.simulator.scene import Camera
 
 
 class NoseMount:
-    """Computes the camera poses of drones.
-
-    Args:
-        camera: the nose camera.
-        device: device of the poses.
-        dtype: floating-point type of the poses.
-    """
+    """Computes the camera poses of drones."""
 
     def __init__(self, camera: Camera, device: torch.device | str = "cpu", dtype: torch.dtype = torch.float64) -> None:
         self._mount = torch.tensor(camera.position, device=device, dtype=dtype)

@@ -11,13 +11,7 @@ import mujoco
 import numpy as np
 
 from dreamer_racing.envs.drone.parameters import QuadrotorParameters
-from dreamer_racing.envs.simulator.opengl import (
-    GL_LIBRARIES,
-    OpenGLScene,
-    RendererUnavailableError,
-    open_scene,
-    require_library,
-)
+from dreamer_racing.envs.simulator.opengl import GL_LIBRARIES, OpenGLScene, RendererUnavailableError, open_scene
 from dreamer_racing.envs.simulator.rendering import RenderThread
 from dreamer_racing.envs.simulator.scene import DRONE_GROUP, HALL_GROUP, Camera, build_scene
 from dreamer_racing.envs.tracks import Track
@@ -38,19 +32,10 @@ class ChaseView:
     Args:
         track: the track. Its hall is rendered in nominal colours.
         parameters: parameters of the drones.
-        num_envs: N.
         size: width and height of the images, pixels.
 
     Raises:
         RendererUnavailableError: neither EGL nor OSMesa works here; the message says why and how to fix it.
-
-    Example:
-        >>> from dreamer_racing.envs.tracks import load_track
-        >>> view = ChaseView(load_track("circle"), QuadrotorParameters())
-        >>> above_the_start = np.array([[4.0, -2.5, 1.35]])
-        >>> view.draw(above_the_start, np.array([[1.0, 0, 0, 0]]), np.array([0]), np.array([0.0])).shape
-        (1, 256, 256, 3)
-        >>> view.close()
     """
 
     def __init__(self, track: Track, parameters: QuadrotorParameters, num_envs: int = 1, size: int = 256) -> None:
@@ -91,9 +76,8 @@ class ChaseView:
         images = np.zeros((len(position), self._size, self._size, 3), np.uint8)
         there = np.isfinite(position).all(1) & np.isfinite(attitude).all(1)
         for index in there.nonzero()[0]:
-            self._thread.submit(
-                self._film, position[index], attitude[index], self._heading[index], images[index]
-            ).result()
+            pose = position[index], attitude[index], self._heading[index]
+            self._thread.submit(self._film, *pose, images[index]).result()
         return images
 
     def _follow(self, position: np.ndarray, target_gate: np.ndarray, time: np.ndarray) -> None:
@@ -128,7 +112,6 @@ def _open(model: mujoco.MjModel, camera: Camera) -> OpenGLScene:
     reasons = []
     for backend in GL_LIBRARIES:
         try:
-            require_library(backend)
             return open_scene(backend, model, camera)
         except RendererUnavailableError as error:
             reasons.append(str(error))

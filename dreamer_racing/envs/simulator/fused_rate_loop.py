@@ -7,7 +7,7 @@
 # mypy: disable-error-code="valid-type,index,no-untyped-def,operator"
 
 from functools import cache
-from typing import Any, NamedTuple
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -15,18 +15,6 @@ from torch import Tensor
 from dreamer_racing.envs.drone import betaflight
 from dreamer_racing.envs.drone.rate_loop import DroneParameter, RateLoop, Row, lowpass_gain
 from dreamer_racing.envs.simulator.warp_device import load_warp
-
-
-class Kernels(NamedTuple):
-    """The warp struct and function of one floating-point type.
-
-    Attributes:
-        firmware: The struct of the constants common to all flight controllers.
-        motor_commands: Advances one flight controller by a physics step and returns its motor commands.
-    """
-
-    firmware: Any
-    motor_commands: Any
 
 
 def arrays(rate_loop: RateLoop | None, like: Tensor) -> list[Any]:
@@ -66,8 +54,8 @@ def fill(rate_loop: RateLoop | None, struct: Any) -> Any:
 
 
 @cache
-def make_kernels(dtype: torch.dtype) -> Kernels:
-    """Make the struct and the function for a floating-point type."""
+def make_kernels(dtype: torch.dtype) -> tuple[Any, Any]:
+    """Make the struct of constants that all flight controllers share, and `motor_commands`, for a type of numbers."""
     wp = load_warp()
     real = wp.dtype_from_torch(dtype)
     vec3, vec4 = wp.types.vector(3, real), wp.types.vector(4, real)
@@ -192,7 +180,7 @@ def make_kernels(dtype: torch.dtype) -> Kernels:
         rates: vec3,
         memory: wp.array2d(dtype=vec3),
         own: wp.array2d(dtype=vec3),
-    ):
+    ):  # advances flight controller i by a physics step; returns its motor commands
         receive(f, i, thrust, wanted, memory)
         throttle = memory[i, THROTTLE][0]
         setpoint = memory[i, SETPOINT]
@@ -234,7 +222,7 @@ def make_kernels(dtype: torch.dtype) -> Kernels:
         feel_throttle(f, i, memory)
         return mix(f, throttle, correction)
 
-    return Kernels(Firmware, motor_commands)
+    return Firmware, motor_commands
 
 
 DEGREES = 57.29577951308232  # per radian

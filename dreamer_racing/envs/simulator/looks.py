@@ -15,26 +15,23 @@ import torch
 from torch import Tensor
 
 from dreamer_racing.envs.simulator.scene import Camera, gate_materials
-from dreamer_racing.settings import NOT_NEGATIVE, check_numbers
+from dreamer_racing.settings import NOT_NEGATIVE, check_settings, setting
 
 
 @dataclass(frozen=True)
 class LooksRandomisation:
     """Half-widths of the uniform, per-episode randomisation of looks; zero disables one."""
 
-    brightness: float = 0.3  # of the light, relative
-    color: float = 0.15  # of red, green and blue of all surfaces but gates and decoys, relative
-    gate_color: float = 0.15  # of red, green and blue of gates and decoys, additive
-    camera_tilt: float = 3.0  # degrees
-    field_of_view: float = 3.0  # degrees
-    noise: float = 0.02  # standard deviation of the pixel noise of each image, relative to full scale
+    brightness: float = setting(0.3, NOT_NEGATIVE)  # of the light, relative
+    color: float = setting(0.15, NOT_NEGATIVE)  # of red, green and blue of all surfaces but gates and decoys, relative
+    gate_color: float = setting(0.15, NOT_NEGATIVE)  # of red, green and blue of gates and decoys, additive
+    camera_tilt: float = setting(3.0, NOT_NEGATIVE)  # degrees
+    field_of_view: float = setting(3.0, NOT_NEGATIVE)  # degrees
+    # standard deviation of the pixel noise of each image, relative to full scale
+    noise: float = setting(0.02, NOT_NEGATIVE)
 
     def __post_init__(self) -> None:
-        widths = vars(self)
-        check_numbers({}, {f"LooksRandomisation: {name}": width for name, width in widths.items()})
-        for name, width in widths.items():
-            if width not in NOT_NEGATIVE:
-                raise ValueError(f"LooksRandomisation: {name}={width} must be finite and not negative.")
+        check_settings(self, "LooksRandomisation: ")
         if self.brightness >= 1.0 or self.color >= 1.0:
             raise ValueError("LooksRandomisation: brightness and color are relative half-widths and must be below 1.")
 
@@ -57,11 +54,6 @@ class LooksSampler:
 
     Args:
         randomisation: the widths of the randomisation.
-        scene: the compiled scene of `build_scene`.
-        camera: the nose camera.
-        num_envs: N.
-        device: device of the looks.
-        dtype: floating-point type of angles and colours.
         generator: source of randomness, on the device.
 
     Attributes:

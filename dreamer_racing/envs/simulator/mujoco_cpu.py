@@ -15,9 +15,8 @@ import torch
 from mujoco.batch import Batch
 from torch import Tensor
 
-from dreamer_racing.envs.drone.parameters import GRAVITY, QuadrotorParameters
+from dreamer_racing.envs.drone.parameters import QuadrotorParameters
 from dreamer_racing.envs.drone.quadrotor import Quadrotor
-from dreamer_racing.envs.drone.rotation import rotate_inverse
 from dreamer_racing.envs.simulator.fused_flight import FusedFlight
 from dreamer_racing.envs.simulator.looks import LooksRandomisation, LooksSampler
 from dreamer_racing.envs.simulator.ray_caster import RayCaster
@@ -44,7 +43,6 @@ class Simulator:
     that advances them by one physics step, and a renderer.
 
     Args:
-        parameters: the drone.
         qpos: (N, 7) the engine's positions and attitudes.
         qvel: (N, 6) the engine's velocities (world) and body rates (body frame).
         qfrc_applied: (N, 6) the forces (world) and torques (body frame) that the engine applies.
@@ -99,15 +97,8 @@ class Simulator:
         return self._flight.fly()
 
     def ideal_imu(self) -> Tensor:
-        """Return ideal gyro and accelerometer measurements of each drone: body rates and specific force (N, 6).
-
-        At its centre, in rad/s and m/s², body frame; the specific force is (0, 0, 9.81) at rest. It is that of the last
-        physics step; after a reset, that of an unaccelerated drone.
-        """
-        change = self.state.linear_velocity - self._flight.qvel_before[:, :3]
-        change[:, 2] += GRAVITY * self.parameters.physics_dt
-        force = rotate_inverse(self.state.attitude, change / self.parameters.physics_dt)
-        return torch.cat((self.state.body_rates, force), dim=1)
+        """Return what ideal IMUs at the drones' centres measure (N, 6); see `FusedFlight.ideal_imu`."""
+        return self._flight.ideal_imu()
 
     def render(self, rows: Tensor | None = None) -> Tensor:
         """Return images of the nose cameras, uint8 (M, height, width, 3).
@@ -174,20 +165,10 @@ class MujocoSimulator(Simulator):
     """Simulator with MuJoCo's C engine, in float64.
 
     Args:
-        track: the track.
-        parameters: the drone.
-        num_envs: N worlds.
-        camera: the nose camera.
         renderer: a name that `make_renderer` takes, or None for no images.
         num_threads: physics and rendering threads; `usable_threads` if None.
         generator: source of the randomisation of physics and looks.
         looks: randomisation of looks; None for the same in every episode.
-
-    Example:
-        >>> from dreamer_racing.envs.tracks import load_track
-        >>> simulator = MujocoSimulator(load_track("kidney"), QuadrotorParameters(), num_envs=4, renderer=None)
-        >>> simulator.step(torch.zeros(4, 4)).shape
-        torch.Size([11, 4, 3])
     """
 
     def __init__(

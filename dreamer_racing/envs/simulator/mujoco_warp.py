@@ -25,23 +25,12 @@ class WarpSimulator(Simulator):
     Neither a step nor rendering all worlds synchronises with the device.
 
     Args:
-        track: the track.
-        parameters: the drone.
-        num_envs: N worlds.
-        camera: the nose camera.
         images: whether to render images.
-        device: torch's name of the device.
         generator: source of the randomisation of physics and looks, on the device.
         looks: randomisation of looks; None for the same in every episode.
 
     Raises:
         ValueError: the device does not have enough memory for so many worlds.
-
-    Example:
-        >>> from dreamer_racing.envs.tracks import load_track
-        >>> simulator = WarpSimulator(load_track("kidney"), QuadrotorParameters(), 4, images=False, device="cpu")
-        >>> simulator.step(torch.zeros(4, 4)).shape
-        torch.Size([11, 4, 3])
     """
 
     def __init__(

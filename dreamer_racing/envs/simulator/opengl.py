@@ -30,8 +30,6 @@ class OpenGLScene:
 
     Args:
         backend: `egl` or `osmesa`.
-        model: the compiled scene.
-        camera: the nose camera.
     """
 
     def __init__(self, backend: str, model: mujoco.MjModel, camera: Camera) -> None:
@@ -99,8 +97,9 @@ def open_scene(backend: str, model: mujoco.MjModel, camera: Camera) -> OpenGLSce
     """Make an `OpenGLScene`.
 
     Raises:
-        RendererUnavailableError: OpenGL did not start; the message says why.
+        RendererUnavailableError: OpenGL is not installed or did not start; the message says why.
     """
+    require_library(backend)
     # llvmpipe, Mesa's software rasteriser, must not start additional threads
     os.environ.setdefault("LP_NUM_THREADS", "0")
     try:

@@ -16,10 +16,7 @@ class RayCaster:
     """Renders a static hall from many cameras at a time; the bounding volumes are built only once.
 
     Args:
-        model: the compiled scene.
-        camera: the nose camera.
         frames: maximum number of frames per launch.
-        device: torch's name of the device.
         varied_looks: whether looks may differ between frames.
     """
 

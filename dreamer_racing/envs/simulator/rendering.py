@@ -21,12 +21,12 @@ import logging
 import weakref
 from collections.abc import Callable
 from concurrent.futures import Future
-from functools import cache
+from functools import cache, partial
 from itertools import zip_longest
 from queue import SimpleQueue
 from threading import Thread
 from threading import enumerate as enumerate_threads
-from typing import Any, NamedTuple, Protocol, TypeVar
+from typing import Any, Protocol, TypeVar
 
 import mujoco
 import torch
@@ -72,14 +72,11 @@ class RenderThread(Thread):
     """A thread that runs submitted functions in order until it is ended.
 
     Unlike an executor's shutdown, `end` takes no lock that may be held already, so the garbage collector may call it.
-
-    Args:
-        name: name of the thread.
     """
 
     def __init__(self, name: str) -> None:
         super().__init__(name=name, daemon=True)
-        self._tasks: SimpleQueue[Task | None] = SimpleQueue()
+        self._tasks: SimpleQueue[Callable[[], None] | None] = SimpleQueue()
         self.start()
 
     def submit(self, function: Callable[..., T], *arguments: Any) -> Future[T]:
@@ -91,41 +88,34 @@ class RenderThread(Thread):
         if not self.is_alive():
             raise RuntimeError("Rendering has ended, because the interpreter exits.")
         future: Future[T] = Future()
-        self._tasks.put(Task(future, function, arguments))
+
+        def work() -> None:
+            try:
+                future.set_result(function(*arguments))
+            except BaseException as error:
+                future.set_exception(error)
+
+        self._tasks.put(work)
         return future
 
     def end(self, last: Callable[[], None] | None) -> None:
         """End the thread after all queued calls and an optional last one; return without waiting."""
         if last is not None:
-            self._tasks.put(Task(None, last, ()))
+            self._tasks.put(partial(_free, last))
         self._tasks.put(None)
 
     def run(self) -> None:
         """Run the queued calls until the thread is ended."""
         while (task := self._tasks.get()) is not None:
-            _do(task)
+            task()
             del task  # or it would keep its arguments alive while waiting for the next task
 
 
-class Task(NamedTuple):
-    """A function call queued in a `RenderThread`."""
-
-    future: Future[Any] | None  # receives the result or exception; None if nobody waits for it
-    function: Callable[..., Any]
-    arguments: tuple[Any, ...]
-
-
-def _do(task: Task) -> None:
+def _free(close: Callable[[], None]) -> None:
     try:
-        result = task.function(*task.arguments)
+        close()
     except BaseException as error:
-        if task.future is None:
-            logger.warning("A renderer could not be freed.", exc_info=error)
-        else:
-            task.future.set_exception(error)
-    else:
-        if task.future is not None:
-            task.future.set_result(result)
+        logger.warning("A renderer could not be freed.", exc_info=error)
 
 
 @atexit.register
@@ -150,7 +140,6 @@ class Renderer:
     Args:
         name: a name from `RENDERERS`, or `WARP_CUDA`.
         make_worker: makes one worker; called once in each thread.
-        camera: the nose camera.
         num_workers: K.
     """
 
@@ -207,8 +196,6 @@ class OpenGLWorker:
 
     Args:
         backend: `egl` or `osmesa`.
-        model: the compiled scene.
-        camera: the nose camera.
 
     Raises:
         RendererUnavailableError: OpenGL did not start.

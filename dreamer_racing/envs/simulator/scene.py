@@ -28,6 +28,7 @@ from dreamer_racing.settings import (
 )
 
 HALL_GROUP = 0  # geom group of hall and gates
+IN_HALL = {"contype": 0, "conaffinity": 0, "group": HALL_GROUP}
 DRONE_GROUP = 2  # geom group of the drone, hidden from its own camera
 CAMERA_NAME = "nose"
 
@@ -45,33 +46,23 @@ LINE_SPACING, LINE_WIDTH, LINE_HEIGHT = 3.0, 0.20, 0.02  # m
 class Camera:
     """The nose camera.
 
-    Args:
-        width: pixels.
-        height: pixels.
-        field_of_view: vertical, degrees, below 180.
-        tilt: upwards, degrees; a racing drone pitches forward when it accelerates.
-        position: mount in the body frame, m.
-        near: distance of the near clipping plane, m.
-        far: distance of the far clipping plane, m.
-        rate: frames per second, Hz, with a whole number of control steps per frame, see `frame_interval`; None for one
-            frame per control step.
-
     Raises:
         ValueError: the message gives the value, and what is allowed.
     """
 
-    width: int = setting(64, COUNT)
-    height: int = setting(64, COUNT)
-    field_of_view: float = setting(90.0, POSITIVE)
-    tilt: float = setting(25.0, FINITE)
-    position: tuple[float, float, float] = (0.10, 0.0, 0.02)
-    near: float = setting(0.01, POSITIVE)
-    far: float = setting(100.0, POSITIVE)
+    width: int = setting(64, COUNT)  # pixels
+    height: int = setting(64, COUNT)  # pixels
+    field_of_view: float = setting(90.0, POSITIVE)  # vertical, degrees, below 180
+    tilt: float = setting(25.0, FINITE)  # upwards, degrees; a racing drone pitches forward when it accelerates
+    position: tuple[float, float, float] = (0.10, 0.0, 0.02)  # mount in the body frame, m
+    near: float = setting(0.01, POSITIVE)  # distance of the near clipping plane, m
+    far: float = setting(100.0, POSITIVE)  # distance of the far clipping plane, m
+    # frames per second, Hz, with a whole number of control steps per frame, see `frame_interval`; None for one frame
+    # per control step
     rate: float | None = setting(None, POSITIVE)
 
     def __post_init__(self) -> None:
-        whole, real = ("width", "height"), ("field_of_view", "tilt", "near", "far")
-        check_numbers(*({f"camera.{name}": getattr(self, name) for name in names} for names in (whole, real)))
+        check_numbers({"camera.width": self.width, "camera.height": self.height}, {})
         check_settings(self, "camera.")
         check_three("camera.position", self.position, FINITE)
         if self.field_of_view >= 180.0:
@@ -203,9 +194,7 @@ def _add_box(spec: mujoco.MjSpec, name: str, low: Sequence[float], high: Sequenc
         pos=corners.mean(axis=0),
         size=(corners[1] - corners[0]) / 2,
         material=_material(spec, rgb),
-        contype=0,
-        conaffinity=0,
-        group=HALL_GROUP,
+        **IN_HALL,
     )
 
 
@@ -237,9 +226,7 @@ def _add_hall(spec: mujoco.MjSpec, track: Track) -> None:
         type=mujoco.mjtGeom.mjGEOM_MESH,
         meshname="floor_lines",
         material=_material(spec, LINE),
-        contype=0,
-        conaffinity=0,
-        group=HALL_GROUP,
+        **IN_HALL,
     )
 
 
@@ -305,9 +292,7 @@ def _add_gate(spec: mujoco.MjSpec, name: str, gate: Gate, rgb: Sequence[float]) 
         pos=gate.position,
         quat=(math.cos(half_yaw), 0.0, 0.0, math.sin(half_yaw)),
         material=_material(spec, rgb),
-        contype=0,
-        conaffinity=0,
-        group=HALL_GROUP,
+        **IN_HALL,
     )
 
 

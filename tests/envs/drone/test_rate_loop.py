@@ -21,6 +21,7 @@ from dreamer_racing.envs.drone.parameters import (
 from dreamer_racing.envs.drone.quadrotor import Quadrotor
 from dreamer_racing.envs.drone.rate_loop import DroneParameter, RateLoop, Row
 from tests.running_recipes import module_of
+from tests.torch_flight import wrench
 
 DRONE = replace(PRESETS["betaflight"], randomisation=None)
 HOVER = DRONE.mass * GRAVITY
@@ -127,7 +128,7 @@ def test_a_drone_draws_its_own_firmware_and_resets_alone() -> None:
     lag = -0.001 / motors_own[:, 0].log()
     assert lag.min() > 0.03 * (1.0 - widths.motor_lag) - 1e-9 and lag.max() < 0.03 * (1.0 + widths.motor_lag) + 1e-9
     assert motors_own[:, 2].min() >= 0.0 and motors_own[:, 2].max() <= widths.sag_max
-    delays = quadrotor.own_parameters()[-1]
+    delays = quadrotor.drones["delay_steps"]
     assert delays.min() >= 5 and delays.max() <= 35
     before = loop.drone_parameters.clone()
     mask = torch.arange(64) == 3
@@ -140,9 +141,9 @@ def test_a_battery_that_sags_gives_less_thrust_the_more_is_asked() -> None:
     given = []
     for sag in (0.0, 0.15):
         quadrotor = Quadrotor(replace(DRONE, drag=(0.0, 0.0, 0.0)), 1)
-        quadrotor._set_motors(torch.ones(1, 1, dtype=torch.bool), 1.0, sag)
+        quadrotor.set_motors(torch.ones(1, 1, dtype=torch.bool), 1.0, sag)
         quadrotor.command(torch.tensor([[1.0, 0.0, 0.0, 0.0]]))
-        given.append([quadrotor.wrench(19, level, STILL, STILL)[0, 2].item() for _ in range(400)][-1])
+        given.append([wrench(quadrotor, 19, level, STILL, STILL)[0, 2].item() for _ in range(400)][-1])
     assert given == pytest.approx([16.0, 16.0 * 0.85], rel=1e-3)
 
 
@@ -156,9 +157,9 @@ def test_a_flight_goes_on_from_its_state() -> None:
     ours.reset(torch.ones(4, dtype=torch.bool))
     ours.command(torch.rand(4, 4, generator=generator))
     for step in range(20):
-        ours.wrench(step, level, rates, rates)
+        wrench(ours, step, level, rates, rates)
     other.load_state_dict(ours.state_dict())
-    assert torch.equal(ours.wrench(0, level, rates, rates), other.wrench(0, level, rates, rates))
+    assert torch.equal(wrench(ours, 0, level, rates, rates), wrench(other, 0, level, rates, rates))
 
 
 @pytest.mark.parametrize(
@@ -208,12 +209,9 @@ def test_a_drone_comes_back_from_its_file(tmp_path: Path) -> None:
     save_drone(path, drone, {"flight": "hil_circle"})
     assert load_preset(str(path)) == drone
     assert "gyro_lpf2" not in path.read_text(), "only what differs is written"
-
-
-def test_a_drone_file_may_change_any_preset(tmp_path: Path) -> None:
-    path = tmp_path / "mine.yml"
-    path.write_text("preset: faithful\nparameters: {mass: 0.5, drag: [0.1, 0.1, 0.2]}\n")
-    assert load_preset(str(path)) == replace(PRESETS["faithful"], mass=0.5, drag=(0.1, 0.1, 0.2))
+    other = tmp_path / "mine.yml"
+    other.write_text("preset: faithful\nparameters: {mass: 0.5, drag: [0.1, 0.1, 0.2]}\n")
+    assert load_preset(str(other)) == replace(PRESETS["faithful"], mass=0.5, drag=(0.1, 0.1, 0.2))
 
 
 @pytest.mark.parametrize(
@@ -221,14 +219,11 @@ def test_a_drone_file_may_change_any_preset(tmp_path: Path) -> None:
     [
         (None, "there is no such file"),
         ("preset: [", "is not valid YAML"),
-        ("- 1", "is not a drone file"),
         ("preset: easy\nparameters: 3", "is not a drone file"),
         ("preset: eazy", r"'eazy' is not one of .*\(did you mean easy\?\)"),
         ("preset: easy\nparameters: {mas: 1}", r"there is no parameter 'mas' \(did you mean mass\?\)"),
-        ("preset: easy\nparameters: {mass: -1}", "mass=-1: must be above 0"),
         ("preset: easy\nparameters: {mass: heavy}", "mass='heavy': must be a number"),
         ("preset: easy\nparameters: {mass: {kg: 1}}", "mass={'kg': 1}: mass has no fields"),
-        ("preset: easy\nparameters: {drag: [1, 2]}", "drag=.*: must be three numbers"),
         ("preset: easy\nparameters: {randomisation: {mass: 0}}", "there is no parameter 'randomisation'"),
         ("preset: betaflight\nparameters: {betaflight: {p: [1, 2, -3]}}", "p=.*: must be three numbers"),
     ],

@@ -51,13 +51,9 @@ def test_batched_equals_single() -> None:
     pilot = ScriptedPilot("circle", dtype=torch.float64)
     generator = torch.Generator().manual_seed(0)
     count = 5
-    position = torch.randn(count, 3, generator=generator, dtype=torch.float64) + torch.tensor([4.0, -2.0, 1.5])
-    attitude = torch.nn.functional.normalize(
-        torch.randn(count, 4, generator=generator, dtype=torch.float64) * 0.2 + torch.tensor([1.0, 0.0, 0.0, 0.0]),
-        dim=1,
-    )
-    velocity = torch.randn(count, 3, generator=generator, dtype=torch.float64)
-    rates = torch.randn(count, 3, generator=generator, dtype=torch.float64)
+    draw = torch.randn(count, 13, generator=generator, dtype=torch.float64)
+    position, velocity, rates = draw[:, :3] + torch.tensor([4.0, -2.0, 1.5]), draw[:, 3:6], draw[:, 6:9]
+    attitude = torch.nn.functional.normalize(draw[:, 9:] * 0.2 + torch.tensor([1.0, 0.0, 0.0, 0.0]), dim=1)
     gate = torch.tensor([0, 0, 1, 2, 3])
 
     def two_steps(rows: slice) -> torch.Tensor:
