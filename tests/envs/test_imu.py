@@ -8,30 +8,27 @@ import gymnasium
 import numpy as np
 import pytest
 import torch
-from gymnasium.spaces import Dict
 from torch import Tensor
 from torchrl.envs.utils import check_env_specs
 
 from dreamer_racing.envs.dm_control_env import load
 from dreamer_racing.envs.drone.parameters import GRAVITY, PRESETS, QuadrotorParameters
-from dreamer_racing.envs.gym_vector_env import DroneRaceVectorEnv
 from dreamer_racing.envs.imu import ACCELEROMETER_RANGE, IMUS, Imu, ImuErrors
-from dreamer_racing.envs.sb3_env import DroneRaceVecEnv
-from dreamer_racing.envs.simulator.backends import make_simulator
+from dreamer_racing.envs.simulator.mujoco_cpu import MujocoSimulator
 from dreamer_racing.envs.simulator.scene import Camera
 from dreamer_racing.envs.torchrl_env import DroneRacingEnv
 from dreamer_racing.envs.tracks import load_track
 from dreamer_racing.envs.worlds import RaceWorlds
 from dreamer_racing.plant.vehicle import PlantVehicle
+from tests.interfaces import flights
 
 SMALL = {"camera": Camera(16, 16), "seed": 3}
 LEVEL = (1.0, 0.0, 0.0, 0.0)
 
 
 def simulated(parameters: QuadrotorParameters, attitude=LEVEL, velocity=(0.0, 0.0, 0.0)):
-    simulator = make_simulator(
-        load_track("circle"), parameters, 1, Camera(), None, 1, torch.Generator().manual_seed(0), "cpu"
-    )
+    generator = torch.Generator().manual_seed(0)
+    simulator = MujocoSimulator(load_track("circle"), parameters, 1, renderer=None, generator=generator)
     rows = [torch.tensor([values], dtype=torch.float64) for values in ((0.0, 0.0, 5.0), attitude, velocity)]
     simulator.reset(torch.tensor([True]), *rows)
     return simulator
@@ -137,25 +134,8 @@ def test_every_interface_gives_the_same_imu() -> None:
     env.close()
     assert expected.dtype == np.float32
     action = np.array([-0.1, 0.1, -0.1, 0.2], np.float32)
-    options = {"observation": "pixels_imu", "preset": "faithful", **SMALL}
-
-    single = gymnasium.make("dreamer_racing/Circle-v0", **options)
-    assert isinstance(single.observation_space, Dict)
-    seen = [single.reset(seed=3)[0], *(single.step(action)[0] for _ in range(5))]
-    assert all(each in single.observation_space for each in seen)
-    single.close()
-    assert np.array_equal([each["imu"] for each in seen], expected)
-
-    vector = DroneRaceVectorEnv(1, "circle", **options)
-    seen = [vector.reset(seed=3)[0], *(vector.step(action[None])[0] for _ in range(5))]
-    vector.close()
-    assert np.array_equal([each["imu"][0] for each in seen], expected)
-
-    several = DroneRaceVecEnv("circle", 1, **options)
-    several.seed(3)
-    seen = [several.reset(), *(several.step(action[None])[0] for _ in range(5))]
-    several.close()
-    assert np.array_equal([each["imu"][0] for each in seen], expected)
+    for name, seen in flights(action, 5, observation="pixels_imu", preset="faithful", **SMALL).items():
+        assert np.array_equal([each["imu"] for each in seen], expected), name
 
 
 def test_dm_control_feels_what_the_batched_worlds_feel() -> None:

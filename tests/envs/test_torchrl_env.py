@@ -1,10 +1,8 @@
 """`DroneRacingEnv`: TorchRL's conformance, and what each key of `docs/api/environments.md` promises."""
 
-import copy
 import gc
-import pickle
 import resource
-from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -16,13 +14,13 @@ from torchrl.envs.utils import check_env_specs
 
 from dreamer_racing.envs.drone.parameters import QuadrotorParameters
 from dreamer_racing.envs.race.gates import CrashCause
+from dreamer_racing.envs.race.pilot import PilotPolicy, ScriptedPilot
 from dreamer_racing.envs.race.race import RewardWeights
 from dreamer_racing.envs.torchrl_env import DroneRacingEnv
-from dreamer_racing.envs.tracks import BUILTIN_TRACKS, Gate, TrackError, make_track
+from dreamer_racing.envs.tracks import BUILTIN_TRACKS, TrackError, load_track
 
 HOVER = (QuadrotorParameters().hover_action, 0.0, 0.0, 0.0)
 STATM = Path("/proc/self/statm")
-STRAIGHT = make_track("straight", [Gate((0.0, 0.0, 1.35), 0.0), Gate((2.0, 0.0, 1.35), 0.0)], laps=1)
 
 
 def blind(num_envs: int = 3, track="circle", **arguments) -> DroneRacingEnv:
@@ -123,20 +121,11 @@ def test_crash_terminates_and_is_not_truncated() -> None:
 
 
 def test_evaluation_finishes_after_the_laps() -> None:
-    env = blind(1, STRAIGHT, evaluation=True)
-
-    def forward(data: TensorDict) -> TensorDict:
-        velocity, attitude = data["privileged", "linear_velocity"][0], data["privileged", "attitude"][0]
-        pitch = 2.0 * attitude[2]  # small angles, nose down is positive
-        height = data["privileged", "position"][0, 2]
-        rate = 6.0 * (0.3 * (2.0 - velocity[0]).clamp(-1, 1) - pitch)
-        thrust = 9.81 + 4.0 * (1.35 - height) - 3.0 * velocity[2]
-        return data.set("action", torch.stack((thrust / 13.33 - 1, rate * 0, rate / 10, rate * 0)).unsqueeze(0))
-
-    data = env.rollout(400, forward)
+    env = blind(1, replace(load_track("circle"), laps=1), evaluation=True)
+    data = env.rollout(400, PilotPolicy(ScriptedPilot(env.track)))
     last = data[0, -1]["next"]
     assert last["race", "finished"].item()
-    assert last["race", "gates_passed"].item() == 2
+    assert last["race", "gates_passed"].item() == 4
     assert (last["truncated"].item(), last["terminated"].item()) == (True, False)
     assert last["race", "lap_time"].item() == pytest.approx(0.02 * data.shape[1])
     assert last["reward"].item() == 10.0
@@ -236,18 +225,11 @@ def test_wrong_action_shape_is_explained() -> None:
         env.step(data.set("action", torch.zeros(3, 3)))
 
 
-@pytest.mark.parametrize("kind", [torch.int64, torch.bool, torch.complex64])
-def test_actions_that_are_no_floats_are_refused(kind: torch.dtype) -> None:
+def test_actions_that_are_no_floats_are_refused() -> None:
     env = blind()
     data = env.reset()
-    with pytest.raises(TypeError, match=f"Action of {kind}: thrust and body rates are floating-point numbers"):
-        env.step(data.set("action", torch.zeros(3, 4, dtype=kind)))
-
-
-@pytest.mark.parametrize("copied", [copy.deepcopy, pickle.dumps])
-def test_an_environment_is_not_copied(copied: Callable[[object], object]) -> None:
-    with pytest.raises(TypeError, match=r"make new ones with the same arguments.*state_dict\(\)"):
-        copied(blind())
+    with pytest.raises(TypeError, match="Action of torch.int64: thrust and body rates are floating-point numbers"):
+        env.step(data.set("action", torch.zeros(3, 4, dtype=torch.int64)))
 
 
 def test_actions_beyond_the_bounds_are_clipped() -> None:
@@ -259,9 +241,8 @@ def test_actions_beyond_the_bounds_are_clipped() -> None:
     assert torch.equal(*ends)
 
 
-@pytest.mark.parametrize("track", ["circle"])
-def test_collector_resets_by_itself(track: str) -> None:
-    env = DroneRacingEnv(track, 4, seed=0, episode_steps=5)
+def test_collector_resets_by_itself() -> None:
+    env = DroneRacingEnv("circle", 4, seed=0, episode_steps=5)
     collector = Collector(env, hover, frames_per_batch=48, total_frames=96)
     batches = list(collector)
     collector.shutdown()
@@ -289,16 +270,11 @@ def test_bad_arguments_are_explained() -> None:
     ("argument", "words"),
     [
         ({"num_envs": 2.5}, "num_envs=2.5: must be a whole number"),
-        ({"num_envs": True}, "num_envs=True: must be a whole number"),
         ({"episode_steps": "100"}, "episode_steps='100': must be a whole number"),
-        ({"num_threads": 0.5}, "num_threads=0.5: must be a whole number"),
         ({"control_rate": "50"}, "control_rate='50': must be a number"),
         ({"start_noise": "much"}, "start_noise='much': must be a number"),
-        ({"num_envs": None}, "num_envs=None: must be a whole number"),
-        ({"start_on_line": None}, "start_on_line=None: must be a number"),
         ({"seed": -1}, "seed=-1: must be at least 0"),
         ({"seed": 2**70}, "seed=1180591620717411303424: must be at least 0 and below 2..63"),
-        ({"seed": "a"}, "seed='a': must be a whole number"),
         ({"camera": "wide"}, "camera='wide': must be a Camera"),
     ],
 )

@@ -103,19 +103,6 @@ def test_images_are_those_of_the_cpu_backends_ray_caster(device: str) -> None:
 
 
 @everywhere
-def test_red_is_the_first_colour(device: str) -> None:
-    ours = on_warp(device, images=True)
-    gate = KIDNEY.gates[0]
-    position = torch.tensor(gate.position) - 2.0 * torch.tensor(gate.forward)
-    half_yaw = torch.tensor(gate.yaw_degrees).deg2rad() / 2
-    attitude = torch.tensor([half_yaw.cos(), 0.0, 0.0, half_yaw.sin()])
-    poses = (value.float().to(device).expand(N, -1) for value in (position, attitude, torch.zeros(3)))
-    ours.reset(torch.ones(N, dtype=torch.bool, device=device), *poses)
-    red, green, blue = ours.render()[0].cpu().float().unbind(-1)
-    assert ((red > 140) & (green < 100) & (blue < 60)).sum() > 300
-
-
-@everywhere
 def test_race_is_the_same_race(device: str) -> None:
     """The same starts and actions: the same passes, crashes and rewards until float32 matters."""
     worlds = [RaceWorlds("kidney", N, from_pixels=False, seed=0, device=device, backend="mujoco_warp"),
