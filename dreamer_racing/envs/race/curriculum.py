@@ -20,12 +20,12 @@ from torchrl.envs.transforms import Transform
 class BodyRateSchedule:
     """Schedule of b₂, the weight of the body-rate penalty in paper Eq. 1, see `BodyRateCurriculum`."""
 
-    threshold: float = 50.0  # mean return above which b₂ grows
-    increment: float = 0.001  # step by which b₂ grows, 1/(rad/s)
-    maximum: float = 0.01  # upper limit of b₂, 1/(rad/s)
-    window: int = 100  # number of episodes in the mean; b₂ does not grow before there are as many
-    cooldown: int = 100  # minimum number of episodes between two increments
-    relabel: bool = True  # whether rewards of replayed steps are recomputed with the current b₂
+    threshold: float = 50.0  # mean return above which b₂ grows.
+    increment: float = 0.001  # step by which b₂ grows, 1/(rad/s).
+    maximum: float = 0.01  # upper limit of b₂, 1/(rad/s).
+    window: int = 100  # number of episodes in the mean; b₂ does not grow before there are as many.
+    cooldown: int = 100  # minimum number of episodes between two increments.
+    relabel: bool = True  # whether rewards of replayed steps are recomputed with the current b₂.
 
 
 class BodyRateCurriculum:
