@@ -17,33 +17,25 @@ STALE = 2.0
 
 
 class Reading(NamedTuple):
-    """A voltage and when it arrived.
+    """A voltage and when it arrived."""
 
-    Args:
-        time: s, ``time.monotonic``.
-        voltage: V, of the whole battery.
-    """
-
-    time: float
-    voltage: float
+    time: float  # s, `time.monotonic`
+    voltage: float  # V, of the whole battery
 
 
 @dataclass(frozen=True, kw_only=True)
 class BatteryConfig:
     """A battery's expected voltage, and how readings of it are checked and smoothed.
 
-    Attributes:
-        voltage: V, assumed until the first reading.
-        tolerance: Share of ``voltage`` by which a reading may differ from it; one that differs more is rejected, as it
-            may be of a single cell.
-        smoothing: s, time constant of a low-pass that smooths out short bursts of throttle.
-
     Raises:
         ValueError: A number is out of its range.
     """
 
-    voltage: float = field(metadata={ALLOWED: POSITIVE})
+    voltage: float = field(metadata={ALLOWED: POSITIVE})  # V, assumed until the first reading
+    # share of `voltage` by which a reading may differ from it; one that differs more is rejected, as it may be of a
+    # single cell
     tolerance: float = setting(0.25, Range(0, 0.5))
+    # s, time constant of a low-pass that smooths out short bursts of throttle
     smoothing: float = setting(0.5, Range(0, 60))
 
     def __post_init__(self) -> None:

@@ -52,78 +52,47 @@ LATENCY = Range(0, 1)
 
 
 class ChainConfig(NamedTuple):
-    """Settings of a flight besides its flyer and its track.
-
-    Args:
-        limits: Safety limits.
-        stamping: How the measurement times of poses are determined.
-        latency: Least time from a pose's measurement to its arrival, s.
-        laps: Laps after which the flight ends and the vehicle is disarmed; None: the operator ends it.
-        arm: Whether the vehicle may be armed at all.
-        battery: Battery settings, if the link reports a voltage and it is used; None otherwise.
-        lift: Largest upward thrust, in weights, that is sent until the vehicle is seen to rise; 0: the flyer takes off
-            by itself.
-    """
+    """Settings of a flight besides its flyer and its track."""
 
     limits: SafetyLimits
-    stamping: Stamping = Stamping.receive
-    latency: float = 0.0
-    laps: int | None = None
-    arm: bool = False
+    stamping: Stamping = Stamping.receive  # how the measurement times of poses are determined
+    latency: float = 0.0  # least time from a pose's measurement to its arrival, s
+    laps: int | None = None  # laps after which the flight ends and the vehicle is disarmed; None: the operator ends it
+    arm: bool = False  # whether the vehicle may be armed at all
+    # battery settings, if the link reports a voltage and it is used; None otherwise
     battery: BatteryConfig | None = None
+    # largest upward thrust, in weights, that is sent until the vehicle is seen to rise; 0: the flyer takes off by
+    # itself
     lift: float = LIFT
 
 
 class Inputs(NamedTuple):
-    """The inputs of a tick.
+    """The inputs of a tick."""
 
-    Args:
-        time: s, by the loop's clock.
-        received: Pose packets since the last tick, oldest first.
-        operator: What the operator wants.
-        overrun: Deadlines missed because the tick before took longer than its period.
-        voltages: Battery readings since the last tick, oldest first.
-        dropped: Whether the command of the tick before was not sent.
-        imu: IMU samples since the last tick, oldest first; read only if the flyer uses them.
-        refusal: Why the flight controller does not follow commands, see `Tick`.
-    """
-
-    time: float
-    received: list[Received]
+    time: float  # s, by the loop's clock
+    received: list[Received]  # pose packets since the last tick, oldest first
     operator: Operator
-    overrun: int
-    voltages: Sequence[Reading] = ()
-    dropped: bool = False
-    imu: Sequence[ImuReading] = ()
-    refusal: str = ""
+    overrun: int  # deadlines missed because the tick before took longer than its period
+    voltages: Sequence[Reading] = ()  # battery readings since the last tick, oldest first
+    dropped: bool = False  # whether the command of the tick before was not sent
+    imu: Sequence[ImuReading] = ()  # IMU samples since the last tick, oldest first; read only if the flyer uses them
+    refusal: str = ""  # why the flight controller does not follow commands, see `Tick`
 
 
 class Outputs(NamedTuple):
-    """The outputs of a tick.
-
-    Args:
-        verdict: State, command and reasons.
-        setpoint: The flyer's, even if the lift is sent instead; None if pose or IMU is missing, or motors are cut.
-        pose: The newest pose, extrapolated to the tick, for which the setpoint was chosen.
-        measured: When that pose was measured, s; NaN without a pose.
-        image: The flyer's input; None if it has no camera, or was not run.
-        target_gate: Index of the gate that comes next.
-        passes: Gates passed in this flight.
-        render_s: Rendering time, s; 0 if the image of an earlier tick is still shown.
-        act_s: The flyer's computing time, s.
-        voltage: V, by which the link converts thrust to throttle; None: unchanged.
-    """
+    """The outputs of a tick."""
 
     verdict: Verdict
+    # the flyer's, even if the lift is sent instead; None if pose or IMU is missing, or motors are cut
     setpoint: Setpoint | None
-    pose: Pose | None
-    measured: float
-    image: np.ndarray | None
-    target_gate: int
-    passes: int
-    render_s: float
-    act_s: float
-    voltage: float | None = None
+    pose: Pose | None  # the newest pose, extrapolated to the tick, for which the setpoint was chosen
+    measured: float  # when that pose was measured, s; NaN without a pose
+    image: np.ndarray | None  # the flyer's input; None if it has no camera, or was not run
+    target_gate: int  # index of the gate that comes next
+    passes: int  # gates passed in this flight
+    render_s: float  # rendering time, s; 0 if the image of an earlier tick is still shown
+    act_s: float  # the flyer's computing time, s
+    voltage: float | None = None  # V, by which the link converts thrust to throttle; None: unchanged
 
 
 class FlightChain:

@@ -41,19 +41,12 @@ SIDEWAYS = 3.0
 
 
 class Step(NamedTuple):
-    """An offset that is added to the hover's setpoint for a while.
+    """An offset that is added to the hover's setpoint for a while."""
 
-    Args:
-        begin: s, from the beginning of the flight.
-        end: s.
-        axis: Index in `AXES`.
-        value: rad/s or m/s².
-    """
-
-    begin: float
-    end: float
-    axis: int
-    value: float
+    begin: float  # s, from the beginning of the flight
+    end: float  # s
+    axis: int  # index in `AXES`
+    value: float  # rad/s or m/s²
 
 
 def make_schedule(seed: int = 0) -> list[Step]:

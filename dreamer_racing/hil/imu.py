@@ -31,15 +31,10 @@ least a half."""
 
 
 class ImuReading(NamedTuple):
-    """A sample and when it arrived.
+    """A sample and when it arrived."""
 
-    Args:
-        time: s, ``time.monotonic``.
-        sample: (6,) body rates, rad/s, and specific force, m/s², FLU.
-    """
-
-    time: float
-    sample: np.ndarray
+    time: float  # s, `time.monotonic`
+    sample: np.ndarray  # (6,) body rates, rad/s, and specific force, m/s², FLU
 
 
 def make_sample(rates: tuple[float, ...], force: tuple[float, ...]) -> np.ndarray | None:

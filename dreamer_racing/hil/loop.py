@@ -73,29 +73,18 @@ class MonotonicClock:
 
 @dataclass
 class LoopStatistics:
-    """Timings of a flight's ticks, all in s.
+    """Timings of a flight's ticks, all in s."""
 
-    Attributes:
-        jitter: How late each tick began.
-        pose_age: Age of the newest pose when the command was sent.
-        latency: Time from a pose's arrival to the sending of the command computed from it.
-        render: Rendering time, in ticks that render.
-        act: The flyer's computing time.
-        busy: Time of a tick until its command is sent.
-        prepare: Time of the work done ahead for the next tick.
-        overruns: Deadlines missed by ticks that took longer than their period: a long one misses several.
-        unrecorded: Whether recording the flight failed on the way.
-    """
-
-    jitter: list[float] = field(default_factory=list)
-    pose_age: list[float] = field(default_factory=list)
+    jitter: list[float] = field(default_factory=list)  # how late each tick began
+    pose_age: list[float] = field(default_factory=list)  # age of the newest pose when the command was sent
+    # time from a pose's arrival to the sending of the command computed from it
     latency: list[float] = field(default_factory=list)
-    render: list[float] = field(default_factory=list)
-    act: list[float] = field(default_factory=list)
-    busy: list[float] = field(default_factory=list)
-    prepare: list[float] = field(default_factory=list)
-    overruns: int = 0
-    unrecorded: bool = False
+    render: list[float] = field(default_factory=list)  # rendering time, in ticks that render
+    act: list[float] = field(default_factory=list)  # the flyer's computing time
+    busy: list[float] = field(default_factory=list)  # time of a tick until its command is sent
+    prepare: list[float] = field(default_factory=list)  # time of the work done ahead for the next tick
+    overruns: int = 0  # deadlines missed by ticks that took longer than their period: a long one misses several
+    unrecorded: bool = False  # whether recording the flight failed on the way
 
     def summary(self) -> dict[str, Any]:
         """Return p50, p99 and the largest of each in ms, and the counts."""

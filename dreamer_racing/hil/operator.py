@@ -39,15 +39,10 @@ logger = logging.getLogger(__name__)
 
 
 class Operator(NamedTuple):
-    """What the operator wants.
+    """What the operator wants."""
 
-    Args:
-        enable: The vehicle may fly.
-        kill: Motors off, now and for good.
-    """
-
-    enable: bool
-    kill: bool
+    enable: bool  # the vehicle may fly
+    kill: bool  # motors off, now and for good
 
 
 class OperatorSource(Protocol):

@@ -26,34 +26,20 @@ LARGEST = 1e6
 
 
 class PosePacket(NamedTuple):
-    """The content of a pose packet.
+    """The content of a pose packet."""
 
-    Args:
-        sequence: Counts packets, modulo 2³².
-        stamp: s, the sender's own clock.
-        position: (3,) m, world.
-        attitude: (4,) wxyz.
-        linear_velocity: (3,) m/s, world.
-        body_rates: (3,) rad/s, body frame.
-    """
-
-    sequence: int
-    stamp: float
-    position: np.ndarray
-    attitude: np.ndarray
-    linear_velocity: np.ndarray
-    body_rates: np.ndarray
+    sequence: int  # counts packets, modulo 2³²
+    stamp: float  # s, the sender's own clock
+    position: np.ndarray  # (3,) m, world
+    attitude: np.ndarray  # (4,) wxyz
+    linear_velocity: np.ndarray  # (3,) m/s, world
+    body_rates: np.ndarray  # (3,) rad/s, body frame
 
 
 class Received(NamedTuple):
-    """A packet and when it arrived.
+    """A packet and when it arrived."""
 
-    Args:
-        time: s, ``time.monotonic``.
-        packet: Its content.
-    """
-
-    time: float
+    time: float  # s, `time.monotonic`
     packet: PosePacket
 
 

@@ -13,17 +13,11 @@ from dreamer_racing.hil.vehicle import Pose
 
 
 class GatePass(NamedTuple):
-    """A gate that was passed.
+    """A gate that was passed."""
 
-    Args:
-        gate: Its index.
-        time: s, by the loop's clock, when the vehicle crossed its plane.
-        offset: m, from its centre.
-    """
-
-    gate: int
-    time: float
-    offset: float
+    gate: int  # its index
+    time: float  # s, by the loop's clock, when the vehicle crossed its plane
+    offset: float  # m, from its centre
 
 
 class GateProgress:

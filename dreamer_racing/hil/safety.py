@@ -47,51 +47,31 @@ _HOVER: Vector = (hover().collective_thrust, 0.0, 0.0, 0.0)
 
 
 class Tick(NamedTuple):
-    """Safety's inputs at a tick of the loop.
+    """Safety's inputs at a tick of the loop."""
 
-    Args:
-        now: s, ``time.monotonic``.
-        pose: The newest measured pose; None if there is none.
-        pose_age: s since it was measured. The time since `Pose.time` counts if it is longer.
-        setpoint: The actor's setpoint; None if it gave none.
-        operator: What the operator wants; None counts as no enable.
-        arm_requested: Whether the program was started with ``arm=true``.
-        contract_mismatch: What of the actor's contract does not fit the vehicle; None if it fits.
-        loop_overrun: Deadlines missed because the tick before took longer than its period.
-        finish: Whether the flight is over.
-        command_dropped: Whether the command of the tick before was not sent.
-        refusal: Why the flight controller does not follow commands, or would not if armed; empty if no reason is known.
-        lift: Setpoint sent instead of the actor's, if that is usable, until the vehicle is seen to rise.
-    """
-
-    now: float
-    pose: Pose | None
-    pose_age: float
-    setpoint: Setpoint | None
-    operator: Operator | None
-    arm_requested: bool
-    contract_mismatch: str | None = None
-    loop_overrun: int = 0
-    finish: bool = False
-    command_dropped: bool = False
+    now: float  # s, `time.monotonic`
+    pose: Pose | None  # the newest measured pose; None if there is none
+    pose_age: float  # s since it was measured. The time since `Pose.time` counts if it is longer
+    setpoint: Setpoint | None  # the actor's setpoint; None if it gave none
+    operator: Operator | None  # what the operator wants; None counts as no enable
+    arm_requested: bool  # whether the program was started with `arm=true`
+    contract_mismatch: str | None = None  # what of the actor's contract does not fit the vehicle; None if it fits
+    loop_overrun: int = 0  # deadlines missed because the tick before took longer than its period
+    finish: bool = False  # whether the flight is over
+    command_dropped: bool = False  # whether the command of the tick before was not sent
+    # why the flight controller does not follow commands, or would not if armed; empty if no reason is known
     refusal: str = ""
+    # setpoint sent instead of the actor's, if that is usable, until the vehicle is seen to rise
     lift: Setpoint | None = None
 
 
 class Verdict(NamedTuple):
-    """The result of a tick.
+    """The result of a tick."""
 
-    Args:
-        state: From this tick on.
-        command: To be sent now.
-        reasons: Why it cut, why it holds, or why it does not arm.
-        words: A message for a person for each reason.
-    """
-
-    state: State
-    command: Command
-    reasons: tuple[Reason, ...]
-    words: tuple[str, ...]
+    state: State  # from this tick on
+    command: Command  # to be sent now
+    reasons: tuple[Reason, ...]  # why it cut, why it holds, or why it does not arm
+    words: tuple[str, ...]  # a message for a person for each reason
 
     @property
     def refusals(self) -> tuple[str, ...]:

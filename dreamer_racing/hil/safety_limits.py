@@ -24,82 +24,62 @@ _MOST = Range(0, 1e4, open_below=True)
 
 @dataclass(frozen=True, kw_only=True)
 class SafetyLimits:
-    """All thresholds of `Safety`. Fence and start position have no default.
+    """All thresholds of `Safety`. Fence and start position have no default."""
 
-    Attributes:
-        fence_low: (3,) m, world: lower corner of the box that the vehicle must not leave.
-        fence_high: (3,) m, world: its upper corner.
-        start_position: (3,) m, world: where the vehicle stands before a flight.
-        start_yaw_degrees: its heading then, from world x, positive to the left.
-        start_box: m, from the start along each axis, within which it may arm.
-        start_yaw_tolerance_degrees: difference from that heading within which it may arm.
-        start_tilt_degrees: tilt from level within which it may arm.
-        start_speed: m/s above which it does not arm, or, when armed, counts as having left the start.
-        release_time: s for which the enable must be released before it counts: a flicker starts no flight.
-        arm_time: s after arming in which no thrust is sent: Betaflight arms at low throttle only.
-        hold_after: s, age of the newest pose above which safety holds.
-        cut_after: s above which safety cuts, for the age of the newest pose, the time in which poses repeat, and the
-            time without a setpoint or without a command accepted by the link.
-        refusal_time: s for which the flight controller may report in flight that it does not follow commands; it is
-            asked with every fifth command.
-        tick_max: s from tick to tick above which the clock has jumped, or the loop has stalled, see `hil.watchdog`.
-        overruns_max: deadlines that the loop may miss within `overrun_window`; a long tick misses several.
-        overrun_window: s.
-        clock_drift_max: ppm by which the clock of a pose sender may run slower than ours, see `stamping.PoseClock`.
-        speed_max: m/s. On Figure 8 in simulation the included agent reaches 12.4, the scripted pilot 12.7.
-        jump_tolerance: m by which two poses may be further apart than `speed_max` allows in the time between them.
-        turn_rate_max: rad/s about any axis, fastest possible turn between two poses.
-        turn_tolerance_degrees: by which two attitudes may be further apart than `turn_rate_max` allows.
-        velocity_tolerance: m/s by which reported velocities may differ from those of the positions.
-        rate_tolerance: rad/s by which reported body rates may differ from those of the attitudes, as long as no two
-            poses are more than ``hold_after`` apart.
-        velocity_window: s over which both are compared, see `hil.odometer`.
-        tilt_max_degrees: tilt from level that may be exceeded for `tilt_time` only.
-        tilt_time: s.
-        still_time: s below `start_speed` after which a vehicle that has flown counts as crashed: racers never hover.
-        lift_off_time: s after arming by which it must have moved: a vehicle that is held fast must stop its motors.
-        lift_time: s of a lift off the stand by which a rise must have been seen: until then the lift is open-loop.
-        thrust_min: m/s², least collective thrust in flight.
-        thrust_max: m/s², largest collective thrust.
-        thrust_slew: m/s³, how fast thrust may change; by default the included actors may use its full range in 1/25 s.
-        rate_max: (3,) rad/s, largest body rates about x, y, z: those of the included actors.
-        rate_slew: rad/s², how fast each body rate may change; default as for `thrust_slew`.
-    """
-
-    fence_low: Vector
-    fence_high: Vector
-    start_position: Vector
-    start_yaw_degrees: float = setting(0.0, Range(-360, 360))
-    start_box: float = setting(0.3, _TOLERANCE)
-    start_yaw_tolerance_degrees: float = setting(15.0, _DEGREES)
-    start_tilt_degrees: float = setting(10.0, _DEGREES)
+    fence_low: Vector  # (3,) m, world: lower corner of the box that the vehicle must not leave
+    fence_high: Vector  # (3,) m, world: its upper corner
+    start_position: Vector  # (3,) m, world: where the vehicle stands before a flight
+    start_yaw_degrees: float = setting(0.0, Range(-360, 360))  # its heading then, from world x, positive to the left
+    start_box: float = setting(0.3, _TOLERANCE)  # m, from the start along each axis, within which it may arm
+    start_yaw_tolerance_degrees: float = setting(15.0, _DEGREES)  # difference from that heading within which it may arm
+    start_tilt_degrees: float = setting(10.0, _DEGREES)  # tilt from level within which it may arm
+    # m/s above which it does not arm, or, when armed, counts as having left the start
     start_speed: float = setting(0.2, _TOLERANCE)
+    # s for which the enable must be released before it counts: a flicker starts no flight
     release_time: float = setting(0.2, Range(0, 10))
+    # s after arming in which no thrust is sent: Betaflight arms at low throttle only
     arm_time: float = setting(0.1, _SECONDS)
-    hold_after: float = setting(0.050, _SECONDS)
+    hold_after: float = setting(0.050, _SECONDS)  # s, age of the newest pose above which safety holds
+    # s above which safety cuts, for the age of the newest pose, the time in which poses repeat, and the time without a
+    # setpoint or without a command accepted by the link
     cut_after: float = setting(0.150, _SECONDS)
+    # s for which the flight controller may report in flight that it does not follow commands; it is asked with every
+    # fifth command
     refusal_time: float = setting(0.75, _SECONDS)
+    # s from tick to tick above which the clock has jumped, or the loop has stalled, see `hil.watchdog`
     tick_max: float = setting(0.200, _SECONDS)
+    # deadlines that the loop may miss within `overrun_window`; a long tick misses several
     overruns_max: int = setting(3, Range(0, 1000))
-    overrun_window: float = setting(1.0, Range(0, 60, open_below=True))
+    overrun_window: float = setting(1.0, Range(0, 60, open_below=True))  # s
+    # ppm by which the clock of a pose sender may run slower than ours, see `stamping.PoseClock`
     clock_drift_max: float = setting(200.0, Range(0, 1e5))
+    # m/s. On Figure 8 in simulation the included agent reaches 12.4, the scripted pilot 12.7
     speed_max: float = setting(15.0, _MOST)
+    # m by which two poses may be further apart than `speed_max` allows in the time between them
     jump_tolerance: float = setting(0.1, _TOLERANCE)
-    turn_rate_max: float = setting(15.0, _MOST)
+    turn_rate_max: float = setting(15.0, _MOST)  # rad/s about any axis, fastest possible turn between two poses
+    # deg by which two attitudes may be further apart than `turn_rate_max` allows
     turn_tolerance_degrees: float = setting(20.0, _DEGREES)
+    # m/s by which reported velocities may differ from those of the positions
     velocity_tolerance: float = setting(4.0, _MOST)
+    # rad/s by which reported body rates may differ from those of the attitudes, as long as no two poses are more than
+    # `hold_after` apart
     rate_tolerance: float = setting(5.0, _MOST)
-    velocity_window: float = setting(0.075, _SECONDS)
-    tilt_max_degrees: float = setting(100.0, _DEGREES)
-    tilt_time: float = setting(0.2, _TOLERANCE)
+    velocity_window: float = setting(0.075, _SECONDS)  # s over which both are compared, see `hil.odometer`
+    tilt_max_degrees: float = setting(100.0, _DEGREES)  # tilt from level that may be exceeded for `tilt_time` only
+    tilt_time: float = setting(0.2, _TOLERANCE)  # s
+    # s below `start_speed` after which a vehicle that has flown counts as crashed: racers never hover
     still_time: float = setting(1.0, Range(0, 3600, open_below=True))
+    # s after arming by which it must have moved: a vehicle that is held fast must stop its motors
     lift_off_time: float = setting(3.0, Range(0, 3600, open_below=True))
+    # s of a lift off the stand by which a rise must have been seen: until then the lift is open-loop
     lift_time: float = setting(0.9, Range(0.5, 2.0))
-    thrust_min: float = setting(0.0, Range(0, 100))
-    thrust_max: float = setting(30.0, Range(0, 1000, open_below=True))
+    thrust_min: float = setting(0.0, Range(0, 100))  # m/s², least collective thrust in flight
+    thrust_max: float = setting(30.0, Range(0, 1000, open_below=True))  # m/s², largest collective thrust
+    # m/s³, how fast thrust may change; by default the included actors may use its full range in 1/25 s
     thrust_slew: float = setting(700.0, _MOST)
-    rate_max: Vector = (10.0, 10.0, 4.0)
-    rate_slew: float = setting(500.0, _MOST)
+    rate_max: Vector = (10.0, 10.0, 4.0)  # (3,) rad/s, largest body rates about x, y, z: those of the included actors
+    rate_slew: float = setting(500.0, _MOST)  # rad/s², how fast each body rate may change; default as for `thrust_slew`
 
     @classmethod
     def of_track(cls, track: Track, **changed: Any) -> Self:

@@ -35,19 +35,12 @@ _PHYSICAL = Range(0, 1e4, open_below=True)
 
 
 class Sticks(NamedTuple):
-    """Stick positions.
+    """Stick positions."""
 
-    Args:
-        roll: In [−1, 1], + right.
-        pitch: In [−1, 1], + forward.
-        yaw: In [−1, 1], + right.
-        throttle: In [0, 1], from 1000 µs to 2000 µs.
-    """
-
-    roll: float
-    pitch: float
-    yaw: float
-    throttle: float
+    roll: float  # in [−1, 1], + right
+    pitch: float  # in [−1, 1], + forward
+    yaw: float  # in [−1, 1], + right
+    throttle: float  # in [0, 1], from 1000 µs to 2000 µs
 
 
 @dataclass(frozen=True)
@@ -55,11 +48,6 @@ class RateMap:
     """The linear map from stick positions to body rates.
 
     In Betaflight: ``rates_type = ACTUAL``, expo 0, and rc_rate and srate both a tenth of the largest rate in deg/s.
-
-    Attributes:
-        roll: rad/s at full stick.
-        pitch: rad/s at full stick.
-        yaw: rad/s at full stick.
 
     Raises:
         ValueError: See `check`.
@@ -69,9 +57,9 @@ class RateMap:
         (0.5, -1.0, -0.25)
     """
 
-    roll: float = field(metadata={ALLOWED: _RATE})
-    pitch: float = field(metadata={ALLOWED: _RATE})
-    yaw: float = field(metadata={ALLOWED: _RATE})
+    roll: float = field(metadata={ALLOWED: _RATE})  # rad/s at full stick
+    pitch: float = field(metadata={ALLOWED: _RATE})  # rad/s at full stick
+    yaw: float = field(metadata={ALLOWED: _RATE})  # rad/s at full stick
 
     def __post_init__(self) -> None:
         self.check()
@@ -101,14 +89,6 @@ class ThrustMap:
     ``motor = idle + (1 − idle) (µs − min_check) / (2000 − min_check)``, and
     ``thrust = full_thrust (voltage / reference_voltage)² motor²``.
 
-    Attributes:
-        mass: kg, with battery.
-        full_thrust: N, of all motors at full command and the reference voltage, as measured on a stand.
-        reference_voltage: V, of the battery under that load.
-        voltage: V, of the battery now; `at` updates it, see `hil.battery`.
-        idle: Motor command at throttle 0: Betaflight's motor_idle (dshot_idle_value).
-        min_check: µs, the channel's value up to which the throttle counts as 0.
-
     Raises:
         ValueError: See `check`.
 
@@ -118,12 +98,15 @@ class ThrustMap:
         (0.607, 0.604)
     """
 
-    mass: float = field(metadata={ALLOWED: _PHYSICAL})
+    mass: float = field(metadata={ALLOWED: _PHYSICAL})  # kg, with battery
+    # N, of all motors at full command and the reference voltage, as measured on a stand
     full_thrust: float = field(metadata={ALLOWED: _PHYSICAL})
-    reference_voltage: float = field(metadata={ALLOWED: _PHYSICAL})
-    voltage: float = field(metadata={ALLOWED: _PHYSICAL})
-    idle: float = field(default=0.055, metadata={ALLOWED: Range(0, 0.2)})  # Betaflight's default and largest
-    min_check: float = field(default=1050.0, metadata={ALLOWED: Range(LOWEST, CENTRE)})  # Betaflight's default, µs
+    reference_voltage: float = field(metadata={ALLOWED: _PHYSICAL})  # V, of the battery under that load
+    voltage: float = field(metadata={ALLOWED: _PHYSICAL})  # V, of the battery now; `at` updates it, see `hil.battery`
+    # motor command at throttle 0: Betaflight's motor_idle (dshot_idle_value) [Betaflight's default and largest]
+    idle: float = field(default=0.055, metadata={ALLOWED: Range(0, 0.2)})
+    # µs, the channel's value up to which the throttle counts as 0; Betaflight's default
+    min_check: float = field(default=1050.0, metadata={ALLOWED: Range(LOWEST, CENTRE)})
 
     def __post_init__(self) -> None:
         self.check()

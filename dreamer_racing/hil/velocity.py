@@ -20,15 +20,10 @@ RATE_MAX = 50.0
 
 
 class Velocity(NamedTuple):
-    """A vehicle's velocity and body rates.
+    """A vehicle's velocity and body rates."""
 
-    Args:
-        linear_velocity: (3,) m/s, world.
-        body_rates: (3,) rad/s, body frame.
-    """
-
-    linear_velocity: np.ndarray
-    body_rates: np.ndarray
+    linear_velocity: np.ndarray  # (3,) m/s, world
+    body_rates: np.ndarray  # (3,) rad/s, body frame
 
 
 class VelocityEstimator:

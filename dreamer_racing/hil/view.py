@@ -202,15 +202,10 @@ def _start_server(memory: int, listening: socket.socket) -> subprocess.Popen[byt
 
 
 class Frame(NamedTuple):
-    """A frame read from memory.
+    """A frame read from memory."""
 
-    Args:
-        numbers: The values of a tick, from `LiveView`.
-        pixels: Raw bytes of the image; empty without one.
-    """
-
-    numbers: dict[str, Any]
-    pixels: bytes
+    numbers: dict[str, Any]  # the values of a tick, from `LiveView`
+    pixels: bytes  # raw bytes of the image; empty without one
 
 
 def read_frame(memory: mmap.mmap, tries: int = 20) -> Frame | None:

@@ -49,19 +49,12 @@ CONVERGED = 0.02
 
 
 class Parameter(NamedTuple):
-    """A parameter to be fitted.
-
-    Args:
-        name: Its name.
-        prior: Standard deviation of its prior: of its logarithm, or of a delay in s [choice].
-        probe: Finite-difference step.
-        axis: Axis of `AXES` whose steps determine it; None: all.
-    """
+    """A parameter to be fitted."""
 
     name: str
-    prior: float
-    probe: float
-    axis: str | None = None
+    prior: float  # standard deviation of its prior: of its logarithm, or of a delay in s [choice]
+    probe: float  # finite-difference step
+    axis: str | None = None  # axis of `AXES` whose steps determine it; None: all
 
 
 PARAMETERS = (
@@ -77,26 +70,18 @@ fitted: their effect is like that of D, and the flight controller's settings giv
 
 @dataclass(frozen=True)
 class Fit:
-    """The result of a fit.
+    """The result of a fit."""
 
-    Attributes:
-        parameters: Parameters of the drone that responds as the recorded one did.
-        values: By name: fitted value, relative to the initial one; for the delay, its change in s.
-        deviations: By name: its standard deviation, as a share, or in s for the delay; from differences of stretches.
-        unknown: Names of parameters that the recording hardly determines: they stay near their initial values.
-        errors: By axis: RMS error of body rates, without the largest `TRIMMED_SHARE`, relative to the RMS of commanded
-            ones.
-        before: As ``errors``, of the initial parameters.
-        thrust: Measured collective thrust, relative to the model's; None if no force was measured.
-    """
-
-    parameters: QuadrotorParameters
-    values: dict[str, float]
+    parameters: QuadrotorParameters  # of the drone that responds as the recorded one did
+    values: dict[str, float]  # by name: fitted value, relative to the initial one; for the delay, its change in s
+    # by name: its standard deviation, as a share, or in s for the delay; from differences of stretches
     deviations: dict[str, float]
+    # names of parameters that the recording hardly determines: they stay near their initial values
     unknown: tuple[str, ...]
+    # by axis: RMS error of body rates, without the largest `TRIMMED_SHARE`, relative to the RMS of commanded ones
     errors: dict[str, float]
-    before: dict[str, float]
-    thrust: float | None
+    before: dict[str, float]  # as `errors`, of the initial parameters
+    thrust: float | None  # measured collective thrust, relative to the model's; None if no force was measured
 
     def lines(self, preset: str) -> Iterator[str]:
         """Yield the fitted parameters, errors and thrust as text; ``preset`` names the initial parameters."""
@@ -116,15 +101,10 @@ class Fit:
 
 
 class Simulated(NamedTuple):
-    """Stretches as simulated with candidates.
+    """Stretches as simulated with candidates."""
 
-    Args:
-        rates: (T / EVERY, C, S, 3) rad/s.
-        force: (T / EVERY, C, S) rotor thrust per mass, m/s².
-    """
-
-    rates: Tensor
-    force: Tensor
+    rates: Tensor  # (T / EVERY, C, S, 3) rad/s
+    force: Tensor  # (T / EVERY, C, S) rotor thrust per mass, m/s²
 
 
 class Model:
@@ -279,21 +259,13 @@ def fit(recorded: Recorded, nominal: QuadrotorParameters) -> Fit:
 
 
 class Step(NamedTuple):
-    """A step of the fit.
+    """A step of the fit."""
 
-    Args:
-        found: (P,) parameters.
-        errors: Their errors, by axis.
-        posterior_deviation: (P,) their posterior standard deviations.
-        sandwich_deviation: (P,) likewise, from differences of stretches.
-        simulated: Simulated with them, and with each one probed.
-    """
-
-    found: Tensor
-    errors: dict[str, float]
-    posterior_deviation: Tensor
-    sandwich_deviation: Tensor
-    simulated: Simulated
+    found: Tensor  # (P,)
+    errors: dict[str, float]  # by axis
+    posterior_deviation: Tensor  # (P,) of the posterior
+    sandwich_deviation: Tensor  # (P,) likewise, from differences of stretches
+    simulated: Simulated  # with them, and with each one probed
 
 
 def _solve(

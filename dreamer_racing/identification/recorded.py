@@ -41,19 +41,12 @@ WINDOW = 1.0
 
 @dataclass(frozen=True)
 class Recorded:
-    """A recording of T ms.
+    """A recording of T ms."""
 
-    Attributes:
-        command: (T, 4) commanded collective thrust, m/s², and body rates, rad/s; held until the next command.
-        fresh: (T,) bool: where a command was sent.
-        rates: (T, 3) measured body rates, rad/s; NaN where nothing was measured.
-        force: (T,) measured specific force along body z, m/s²; NaN where nothing was measured.
-    """
-
-    command: np.ndarray
-    fresh: np.ndarray
-    rates: np.ndarray
-    force: np.ndarray
+    command: np.ndarray  # (T, 4) commanded collective thrust, m/s², and body rates, rad/s; held until the next command
+    fresh: np.ndarray  # (T,) bool: where a command was sent
+    rates: np.ndarray  # (T, 3) measured body rates, rad/s; NaN where nothing was measured
+    force: np.ndarray  # (T,) measured specific force along body z, m/s²; NaN where nothing was measured
 
     def excited_seconds(self) -> tuple[float, ...]:
         """Return for how long each axis was moved while it was measured, s: roll, pitch, yaw, thrust."""

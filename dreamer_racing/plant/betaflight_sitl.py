@@ -33,16 +33,12 @@ _STAMP = 1.0  # s, constant: the firmware paces its clock by timestamps, and los
 
 
 class PacketConvention(NamedTuple):
-    """Conventions of a firmware's packets.
+    """Conventions of a firmware's packets."""
 
-    Args:
-        rotors: (4,) index of the rotor of each motor command: M1 … M4 are rear right, front right, rear left, front
-            left, indices 0 … 3.
-        yaw_rate_sign: Sign of the body rate about z in state packets, relative to FLU.
-    """
-
+    # (4,) index of the rotor of each motor command: M1 … M4 are rear right, front right, rear left, front left, indices
+    # 0 … 3
     rotors: tuple[int, int, int, int]
-    yaw_rate_sign: float
+    yaw_rate_sign: float  # sign of the body rate about z in state packets, relative to FLU
 
 
 CONVENTIONS = {"2026.6": PacketConvention((0, 1, 2, 3), 1.0), "before": PacketConvention((1, 2, 3, 0), -1.0)}

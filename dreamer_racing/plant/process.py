@@ -231,17 +231,11 @@ def firmware_option(options: ProcessOptions) -> str | None:
 
 
 class Sockets(NamedTuple):
-    """The sockets of a plant.
+    """The sockets of a plant."""
 
-    Args:
-        incoming: Commands, or the firmware's motors.
-        poses: To the receiver of poses.
-        state: To the firmware.
-    """
-
-    incoming: socket.socket
-    poses: UdpTransport
-    state: UdpTransport
+    incoming: socket.socket  # commands, or the firmware's motors
+    poses: UdpTransport  # to the receiver of poses
+    state: UdpTransport  # to the firmware
 
     def close(self) -> None:
         """Close all sockets."""

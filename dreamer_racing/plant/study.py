@@ -38,27 +38,16 @@ measures how much noise a flyer tolerates, not safety."""
 
 
 class StudyFlight(NamedTuple):
-    """The result of a flight.
+    """The result of a flight."""
 
-    Args:
-        sweep: Name of the changed parameter.
-        value: Its value.
-        seed: Seed of the poses' noise.
-        gates: Number of gates passed in order, as counted by the plant.
-        finished: Whether all laps were flown.
-        lap_time: Mean lap time, s; None without a lap.
-        speed_max: m/s.
-        ended: Why it ended, in words.
-    """
-
-    sweep: str
+    sweep: str  # the changed parameter
     value: float
-    seed: int
-    gates: int
-    finished: bool
-    lap_time: float | None
-    speed_max: float
-    ended: str
+    seed: int  # seed of the poses' noise
+    gates: int  # passed in order, as counted by the plant
+    finished: bool  # whether all laps were flown
+    lap_time: float | None  # mean lap time, s; None without a lap
+    speed_max: float  # m/s
+    ended: str  # why it ended, in words
 
 
 def study(

@@ -36,19 +36,12 @@ _RELEASE = re.compile(r"# Betaflight / SITL \(\w+\) (\d+(?:\.\d+)+\S*)")
 
 
 class Ports(NamedTuple):
-    """The ports of a firmware, all on 127.0.0.1.
+    """The ports of a firmware, all on 127.0.0.1."""
 
-    Args:
-        motors: UDP, to which it sends motor commands.
-        state: UDP, for the vehicle's state.
-        channels: UDP, for a radio's channels.
-        serial: TCP, its first serial port: MSP and CLI.
-    """
-
-    motors: int = 9002
-    state: int = 9003
-    channels: int = 9004
-    serial: int = 5761
+    motors: int = 9002  # UDP, to which it sends motor commands
+    state: int = 9003  # UDP, for the vehicle's state
+    channels: int = 9004  # UDP, for a radio's channels
+    serial: int = 5761  # TCP, its first serial port: MSP and CLI
 
     @classmethod
     def free(cls, motors: int) -> Self:

@@ -32,27 +32,17 @@ _NO_DUMP = (
 
 
 class Setting(NamedTuple):
-    """A required setting.
+    """A required setting."""
 
-    Args:
-        name: Name of the setting, or of another property read from the dump.
-        value: The required value.
-        reason: Why.
-        default: The firmware's default, if it does not depend on board or release; ``diff`` leaves it out.
-        section: ``profile`` or ``rateprofile`` if each profile has its own.
-        line: Line for the CLI; made from name and value if empty.
-        former: Its name in older releases.
-        absent: Whether a firmware without the setting behaves as required: then ``dump all`` need not name it.
-    """
-
-    name: str
+    name: str  # name of the setting, or of another property read from the dump
     value: str
     reason: str
+    # the firmware's default, if it does not depend on board or release; `diff` leaves it out
     default: str | None = None
-    section: str = ""
-    line: str = ""
-    former: str = ""
-    absent: bool = False
+    section: str = ""  # `profile` or `rateprofile` if each profile has its own
+    line: str = ""  # line for the CLI; made from name and value if empty
+    former: str = ""  # its name in older releases
+    absent: bool = False  # whether a firmware without the setting behaves as required: then `dump all` need not name it
 
     @property
     def command(self) -> str:

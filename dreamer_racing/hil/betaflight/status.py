@@ -55,17 +55,11 @@ _LEAST = _HEAD + 5
 
 
 class FlightControllerStatus(NamedTuple):
-    """The status of a flight controller.
+    """The status of a flight controller."""
 
-    Args:
-        modes: Which are on, one bit each: the first is ARM, the others are given by MSP_BOXIDS.
-        flags: What prevents arming, one bit each.
-        total: Number of flags that exist.
-    """
-
-    modes: int
-    flags: int
-    total: int
+    modes: int  # which are on, one bit each: the first is ARM, the others are given by MSP_BOXIDS
+    flags: int  # what prevents arming, one bit each
+    total: int  # number of flags that exist
 
     @property
     def armed(self) -> bool:

@@ -45,35 +45,23 @@ from dreamer_racing.settings import check_choice, given
 class LinkConfig:
     """The choice of a link, and its settings.
 
-    Attributes:
-        name: One of `LINKS`.
-        host: Host to send to over UDP or TCP.
-        port: UDP port, for ``betaflight_sitl`` 9004 unless given; for ``msp`` and ``msp_override`` without a device the
-            TCP port of a firmware on this machine.
-        device: Path of a serial port.
-        baud: Bits a second of the serial port; by default the protocol's.
-        rates: Map from sticks to body rates.
-        thrust: Map from throttle to thrust.
-        arm_channel: Index of the channel that arms, 4 for AUX1.
-        imu: Whether to receive IMU samples.
-        serial_port: For ``betaflight_sitl``: TCP port of the firmware's MSP.
-        rate: Commands a second, to refuse a serial port that is too slow for them; None: not checked.
-
     Raises:
         ValueError: ``arm_channel`` is no switch.
     """
 
-    name: str
-    host: str = "127.0.0.1"
+    name: str  # one of `LINKS`
+    host: str = "127.0.0.1"  # host to send to over UDP or TCP
+    # UDP port, for `betaflight_sitl` 9004 unless given; for `msp` and `msp_override` without a device the TCP port of a
+    # firmware on this machine
     port: int | None = None
-    device: str | None = None
-    baud: int | None = None
+    device: str | None = None  # a serial port
+    baud: int | None = None  # bits a second of the serial port; by default the protocol's
     rates: RateMap | None = None
     thrust: ThrustMap | None = None
-    arm_channel: int = FIRST_SWITCH
-    rate: float | None = None
-    imu: bool = False
-    serial_port: int = MSP_PORT
+    arm_channel: int = FIRST_SWITCH  # index of the channel that arms, 4 for AUX1
+    rate: float | None = None  # commands a second, to refuse a serial port that is too slow for them; None: not checked
+    imu: bool = False  # whether to receive IMU samples
+    serial_port: int = MSP_PORT  # for `betaflight_sitl`: TCP port of the firmware's MSP
 
     def __post_init__(self) -> None:
         check_arm_channel(self.arm_channel)

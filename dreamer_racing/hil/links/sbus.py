@@ -21,17 +21,11 @@ _FLAGS = 0x0F  # of channels 17 and 18, and the two above
 
 
 class SbusFrame(NamedTuple):
-    """The content of a frame.
+    """The content of a frame."""
 
-    Args:
-        channels: (16,) µs.
-        frame_lost: Whether the receiver missed the last frame of its radio.
-        failsafe: Whether it has received nothing for long; channels are substitutes then.
-    """
-
-    channels: tuple[float, ...]
-    frame_lost: bool
-    failsafe: bool
+    channels: tuple[float, ...]  # (16,) µs
+    frame_lost: bool  # whether the receiver missed the last frame of its radio
+    failsafe: bool  # whether it has received nothing for long; channels are substitutes then
 
 
 def encode_sbus(channels: Sequence[float], frame_lost: bool = False, failsafe: bool = False) -> bytes:

@@ -12,17 +12,11 @@ from dreamer_racing.commands import install_extra
 
 
 class SerialSettings(NamedTuple):
-    """Settings of a serial line with 8 data bits.
+    """Settings of a serial line with 8 data bits."""
 
-    Args:
-        baud: Bits a second.
-        parity: ``N`` for none, ``E`` for even.
-        stop_bits: 1 or 2.
-    """
-
-    baud: int
-    parity: str
-    stop_bits: int
+    baud: int  # bits a second
+    parity: str  # `N` for none, `E` for even
+    stop_bits: int  # 1 or 2
 
     def seconds(self, size: int) -> float:
         """Return how long ``size`` bytes take, s: each with a start bit, 8 data bits, any parity bit, and stop bits."""

@@ -39,16 +39,10 @@ _TRANSIENT_ERRORS = {
 
 
 class CommandPacket(NamedTuple):
-    """The content of a command packet.
+    """The content of a command packet."""
 
-    Args:
-        sequence: Counts packets, modulo 2³²; one that is not newer than the last is a repeated or late one.
-        stamp: s, the sender's own clock.
-        command: The command.
-    """
-
-    sequence: int
-    stamp: float
+    sequence: int  # counts packets, modulo 2³²; one that is not newer than the last is a repeated or late one
+    stamp: float  # s, the sender's own clock
     command: Command
 
 

@@ -29,27 +29,18 @@ from dreamer_racing.settings import Range, check_choice, check_settings, given, 
 class PoseConfig:
     """The choice of a pose source, and its settings.
 
-    Attributes:
-        name: One of `POSE_SOURCES`.
-        host: Address to listen on over UDP; the default accepts poses from this machine only.
-        port: UDP port to listen on; 0 for a free one.
-        device: Path of a serial port; if given, ``mavlink`` listens to it and not to the UDP port.
-        baud: Bits a second of the serial port; by default the protocol's.
-        topic: Topic of ROS 2.
-        message: Message type of the pose; by default the source's first one.
-        smoothing: s, time constant of velocities estimated from poses; 0: they are not smoothed.
-
     Raises:
         ValueError: A number is out of its range.
     """
 
-    name: str
-    host: str = "127.0.0.1"
-    port: int | None = setting(None, Range(0, 65535))
-    device: str | None = None
-    baud: int | None = setting(None, Range(1))
-    topic: str | None = None
-    message: str | None = None
+    name: str  # one of `POSE_SOURCES`
+    host: str = "127.0.0.1"  # address to listen on over UDP; the default accepts poses from this machine only
+    port: int | None = setting(None, Range(0, 65535))  # UDP port to listen on; 0 for a free one
+    device: str | None = None  # path of a serial port; if given, `mavlink` listens to it and not to the UDP port
+    baud: int | None = setting(None, Range(1))  # bits a second of the serial port; by default the protocol's
+    topic: str | None = None  # topic of ROS 2
+    message: str | None = None  # message type of the pose; by default the source's first one
+    # s, time constant of velocities estimated from poses; 0: they are not smoothed
     smoothing: float = setting(SMOOTHING, Range(0, 1))
 
     def __post_init__(self) -> None:

@@ -19,23 +19,15 @@ SMOOTHING = 0.01
 
 
 class Measurement(NamedTuple):
-    """The content of a message, in the frames of `Pose`; not yet checked.
+    """The content of a message, in the frames of `Pose`; not yet checked."""
 
-    Args:
-        stamp: s, the sender's own clock.
-        position: (3,) m, world.
-        attitude: (4,) wxyz.
-        linear_velocity: (3,) m/s, world, or body if ``in_body``; None: estimated from poses, as are body rates.
-        body_rates: (3,) rad/s, body frame.
-        in_body: Whether ``linear_velocity`` is along the body's axes.
-    """
-
-    stamp: float
-    position: np.ndarray
-    attitude: np.ndarray
+    stamp: float  # s, the sender's own clock
+    position: np.ndarray  # (3,) m, world
+    attitude: np.ndarray  # (4,) wxyz
+    # (3,) m/s, world, or body if `in_body`; None: estimated from poses, as are body rates
     linear_velocity: np.ndarray | None = None
-    body_rates: np.ndarray | None = None
-    in_body: bool = False
+    body_rates: np.ndarray | None = None  # (3,) rad/s, body frame
+    in_body: bool = False  # whether `linear_velocity` is along the body's axes
 
 
 class MessagePose(ABC):
