@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import importlib
 import os
 import shutil
 import sys
 from pathlib import Path
+from typing import Any
 
 ROOT = Path(__file__).resolve().parents[1]
 """Root of the clone, if the package runs from one."""
@@ -40,3 +42,20 @@ def install_extra(extra: str) -> str:
     cloned = (ROOT / "pyproject.toml").is_file()
     place = from_here(ROOT) if cloned else "dreamer_racing"
     return f"{dev()}pip install {'-e ' if cloned else ''}'{place}[{extra}]'"
+
+
+def import_extra(module: str, extra: str, needed: str) -> Any:
+    """Import a module that an extra installs.
+
+    Args:
+        module: Its name.
+        extra: Name of the extra.
+        needed: What needs which package, for the message.
+
+    Raises:
+        ImportError: It is not installed; the message says how to install it.
+    """
+    try:
+        return importlib.import_module(module)
+    except ImportError as error:
+        raise ImportError(f"{needed}: {install_extra(extra)}.") from error

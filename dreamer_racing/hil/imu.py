@@ -1,26 +1,20 @@
 """Samples of a flight controller's gyro and accelerometer, and the UDP packet in which a plant sends them.
 
 A sample is (6,): body rates in rad/s, then specific force in m/s², +9.81 upwards at rest; body frame FLU. The packet,
-little endian, 68 bytes: ``b"DRI1"``, sequence number u32, the sender's time f64 (s), six f64, and CRC-32 u32 of all
-before it.
+68 bytes (`hil.packets`): ``b"DRI1"``, sequence number u32, the sender's time f64 (s), and six f64.
 """
 
 from __future__ import annotations
 
 import math
-import struct
-import zlib
 from typing import NamedTuple
 
 import numpy as np
 
 from dreamer_racing.envs.drone.parameters import GRAVITY
+from dreamer_racing.hil.packets import PacketFormat
 
-MAGIC = b"DRI1"
-_BODY = struct.Struct("<4sId6d")
-_CHECK = struct.Struct("<I")
-PACKET_SIZE = _BODY.size + _CHECK.size
-"""Bytes of a packet: 68."""
+PACKET = PacketFormat(b"DRI1", "Id6d")
 
 LARGEST = 1e4
 """rad/s or m/s² beyond which a number is no measurement of a drone [choice]."""
@@ -45,20 +39,13 @@ def make_sample(rates: tuple[float, ...], force: tuple[float, ...]) -> np.ndarra
 
 def encode_imu(sequence: int, stamp: float, sample: np.ndarray) -> bytes:
     """Return the bytes of a packet."""
-    body = _BODY.pack(MAGIC, sequence % 2**32, stamp, *(float(number) for number in sample))
-    return body + _CHECK.pack(zlib.crc32(body))
+    return PACKET.pack(sequence % 2**32, stamp, *sample)
 
 
 def decode_imu(data: bytes) -> np.ndarray | None:
     """Return the sample in a packet; None if it has another size or kind, is damaged, or is not plausible."""
-    if (
-        len(data) != PACKET_SIZE
-        or data[:4] != MAGIC
-        or _CHECK.unpack_from(data, _BODY.size)[0] != zlib.crc32(data[: _BODY.size])
-    ):
-        return None
-    _, _, _, *numbers = _BODY.unpack_from(data)
-    return make_sample(tuple(numbers[:3]), tuple(numbers[3:]))
+    content = PACKET.unpack(data)
+    return None if content is None else make_sample(content[2:5], content[5:])
 
 
 def check_at_rest(sample: np.ndarray) -> str | None:

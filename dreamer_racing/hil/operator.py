@@ -12,20 +12,16 @@ import contextlib
 import logging
 import os
 import socket
-import struct
 import sys
 import time
-import zlib
 from collections.abc import Callable
 from typing import IO, Any, NamedTuple, Protocol
 
 from dreamer_racing.hil.inlet import bind
+from dreamer_racing.hil.packets import PacketFormat
 
-MAGIC = b"DRO1"
-_BODY = struct.Struct("<4sIBB")
-_CHECK = struct.Struct("<I")
-PACKET_SIZE = _BODY.size + _CHECK.size
-"""Bytes of a packet: 14, little endian: ``b"DRO1"``, sequence u32, enable u8, kill u8, CRC-32 u32 of all before it."""
+PACKET = PacketFormat(b"DRO1", "IBB")
+"""Sequence number u32, enable u8, kill u8."""
 
 PORT = 9102
 DEAD_MAN = 0.5
@@ -59,17 +55,15 @@ class OperatorSource(Protocol):
 
 def encode_operator(sequence: int, operator: Operator) -> bytes:
     """Return the bytes of a packet."""
-    body = _BODY.pack(MAGIC, sequence % 2**32, operator.enable, operator.kill)
-    return body + _CHECK.pack(zlib.crc32(body))
+    return PACKET.pack(sequence % 2**32, *operator)
 
 
 def decode_operator(data: bytes) -> tuple[int, Operator] | None:
     """Return a packet's sequence number and content; None if it is not such a packet, or damaged."""
-    if len(data) != PACKET_SIZE or data[:4] != MAGIC:
+    content = PACKET.unpack(data)
+    if content is None or max(content[1:]) > 1:
         return None
-    _, sequence, enable, kill = _BODY.unpack_from(data)
-    if _CHECK.unpack_from(data, _BODY.size)[0] != zlib.crc32(data[: _BODY.size]) or max(enable, kill) > 1:
-        return None
+    sequence, enable, kill = content
     return sequence, Operator(bool(enable), bool(kill))
 
 
@@ -101,7 +95,7 @@ class UdpOperator:
         """Return the operator's wish, without blocking."""
         for _ in range(self._MOST):
             try:
-                data = self._socket.recv(PACKET_SIZE + 1)
+                data = self._socket.recv(PACKET.size + 1)
             except (BlockingIOError, ConnectionRefusedError):
                 break
             self._take(decode_operator(data))

@@ -2,24 +2,19 @@
 
 The packet, little endian, 124 bytes: ``b"DRP1"``, sequence number u32, the sender's time f64 (s, of any clock that does
 not jump), position 3 f64, attitude 4 f64 (wxyz), linear velocity 3 f64, body rates 3 f64, and CRC-32 u32 of all before
-it. Frames and units are those of `Pose`.
+it (`hil.packets`). Frames and units are those of `Pose`.
 """
 
 from __future__ import annotations
 
-import struct
-import zlib
 from typing import NamedTuple, Protocol
 
 import numpy as np
 
 from dreamer_racing.hil.inlet import UdpInlet
+from dreamer_racing.hil.packets import PacketFormat
 
-MAGIC = b"DRP1"
-_BODY = struct.Struct("<4sId13d")
-_CHECK = struct.Struct("<I")
-PACKET_SIZE = _BODY.size + _CHECK.size
-"""Bytes of a packet: 124."""
+PACKET = PacketFormat(b"DRP1", "Id13d")
 
 LARGEST = 1e6
 """m, m/s, rad/s or rad beyond which a number is no measurement of a drone [choice]."""
@@ -65,19 +60,14 @@ class PoseSource(Protocol):
 def encode_pose(packet: PosePacket) -> bytes:
     """Return the bytes of a packet."""
     numbers = (*packet.position, *packet.attitude, *packet.linear_velocity, *packet.body_rates)
-    body = _BODY.pack(MAGIC, packet.sequence % 2**32, packet.stamp, *(float(number) for number in numbers))
-    return body + _CHECK.pack(zlib.crc32(body))
+    return PACKET.pack(packet.sequence % 2**32, packet.stamp, *numbers)
 
 
 def decode_pose(data: bytes) -> PosePacket | None:
     """Return a packet's content; None if it has another size or kind, is damaged, or has impossible numbers."""
-    if (
-        len(data) != PACKET_SIZE
-        or data[:4] != MAGIC
-        or _CHECK.unpack_from(data, _BODY.size)[0] != zlib.crc32(data[: _BODY.size])
-    ):
+    if (content := PACKET.unpack(data)) is None:
         return None
-    _, sequence, stamp, *numbers = _BODY.unpack_from(data)
+    sequence, stamp, *numbers = content
     values = np.array(numbers)
     return make_packet(sequence, stamp, values[:3], values[3:7], values[7:10], values[10:])
 

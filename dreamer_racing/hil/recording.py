@@ -18,7 +18,7 @@ from typing import Any, Self
 
 import numpy as np
 
-from dreamer_racing.commands import install_extra
+from dreamer_racing.commands import import_extra
 from dreamer_racing.envs.tracks import Track, load_track, read_track
 from dreamer_racing.hil.background_worker import BackgroundWorker
 
@@ -192,9 +192,4 @@ def _plain(value: Any) -> Any:
 
 
 def _import_mcap(module: str) -> Any:
-    import importlib
-
-    try:
-        return importlib.import_module(f"mcap.{module}")
-    except ImportError as error:
-        raise ImportError(f"mcap is not installed: {install_extra('hil')}.") from error
+    return import_extra(f"mcap.{module}", "hil", "Recordings of flights need mcap")

@@ -1,4 +1,4 @@
-"""Converts setpoints to the sticks of a radio, by which a Betaflight flight controller is flown, and back.
+"""Converts setpoints to the sticks of a radio, by which a Betaflight flight controller is flown.
 
 Rates and thrust are mapped separately: `RateMap` is the flight controller's map from sticks to rates, fixed by its
 configuration; `ThrustMap` is the map from throttle to thrust of motors and battery, which changes in flight.
@@ -17,11 +17,11 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field, replace
-from typing import NamedTuple, Self
+from typing import Self
 
 import numpy as np
 
-from dreamer_racing.hil.vehicle import GRAVITY, Command, Setpoint
+from dreamer_racing.hil.vehicle import GRAVITY, Command
 from dreamer_racing.settings import ALLOWED, Range, check_settings
 
 LOWEST, CENTRE, HIGHEST = 1000.0, 1500.0, 2000.0
@@ -34,15 +34,6 @@ _RATE = Range(0, math.radians(2000), open_below=True)  # Betaflight's rc_rate en
 _PHYSICAL = Range(0, 1e4, open_below=True)
 
 
-class Sticks(NamedTuple):
-    """Stick positions."""
-
-    roll: float  # in [−1, 1], + right
-    pitch: float  # in [−1, 1], + forward
-    yaw: float  # in [−1, 1], + right
-    throttle: float  # in [0, 1], from 1000 µs to 2000 µs
-
-
 @dataclass(frozen=True)
 class RateMap:
     """The linear map from stick positions to body rates.
@@ -50,7 +41,7 @@ class RateMap:
     In Betaflight: ``rates_type = ACTUAL``, expo 0, and rc_rate and srate both a tenth of the largest rate in deg/s.
 
     Raises:
-        ValueError: See `check`.
+        ValueError: No flight controller can be set to such rates; the message gives the field and what is allowed.
 
     Example:
         >>> RateMap(roll=10.0, pitch=10.0, yaw=4.0).to_sticks(np.array([5.0, -10.0, 1.0]))
@@ -62,24 +53,12 @@ class RateMap:
     yaw: float = field(metadata={ALLOWED: _RATE})  # rad/s at full stick
 
     def __post_init__(self) -> None:
-        self.check()
-
-    def check(self) -> None:
-        """Refuse rates that no flight controller can be set to.
-
-        Raises:
-            ValueError: The message gives the field, its value, and what is allowed.
-        """
         check_settings(self, "RateMap.")
 
     def to_sticks(self, body_rates: np.ndarray) -> tuple[float, float, float]:
         """Return roll, pitch and yaw stick for body rates (3,) in rad/s; full stick if they are larger."""
         roll, pitch, yaw = (float(rate) for rate in body_rates)
         return _clamp(roll / self.roll, -1, 1), _clamp(pitch / self.pitch, -1, 1), _clamp(-yaw / self.yaw, -1, 1)
-
-    def from_sticks(self, roll: float, pitch: float, yaw: float) -> np.ndarray:
-        """Return the body rates (3,) in rad/s that sticks ask for."""
-        return np.array([roll * self.roll, pitch * self.pitch, -yaw * self.yaw])
 
 
 @dataclass(frozen=True)
@@ -90,7 +69,7 @@ class ThrustMap:
     ``thrust = full_thrust (voltage / reference_voltage)² motor²``.
 
     Raises:
-        ValueError: See `check`.
+        ValueError: No flying drone has such values; the message gives the field, its value, and what is allowed.
 
     Example:
         >>> thrust = ThrustMap(mass=0.6, full_thrust=16.0, reference_voltage=15.0, voltage=15.0)
@@ -109,14 +88,6 @@ class ThrustMap:
     min_check: float = field(default=1050.0, metadata={ALLOWED: Range(LOWEST, CENTRE)})
 
     def __post_init__(self) -> None:
-        self.check()
-
-    def check(self) -> None:
-        """Refuse values that no flying drone has.
-
-        Raises:
-            ValueError: The message gives the field, its value, and what is allowed.
-        """
         check_settings(self, "ThrustMap.")
         low, high = self._voltage_ends
         if not low <= self.voltage <= high:
@@ -137,7 +108,7 @@ class ThrustMap:
         return 0.5 * self.reference_voltage, 1.5 * self.reference_voltage
 
     def at(self, voltage: float) -> Self:
-        """Return the map at another voltage, V, or at the nearest one that `check` allows; this never raises.
+        """Return the map at another voltage, V, or at the nearest one that is allowed; this never raises.
 
         A voltage too low to lift the drone counts as one that just does; a non-finite one changes nothing.
         """
@@ -165,22 +136,6 @@ class ThrustMap:
         share = (self.to_motor(collective_thrust) - self.idle) / (1 - self.idle)
         return _clamp((self.min_check + share * (HIGHEST - self.min_check) - LOWEST) / (HIGHEST - LOWEST), 0, 1)
 
-    def from_sticks(self, throttle: float) -> float:
-        """Return the collective thrust in m/s² that armed motors make at a throttle in [0, 1]."""
-        microseconds = LOWEST + (HIGHEST - LOWEST) * throttle
-        share = max((microseconds - self.min_check) / (HIGHEST - self.min_check), 0.0)
-        return self.collective_thrust_max * (self.idle + (1 - self.idle) * share) ** 2
-
-
-def to_sticks(setpoint: Setpoint, rates: RateMap, thrust: ThrustMap) -> Sticks:
-    """Return the sticks that ask for a setpoint, or for the nearest possible one."""
-    return Sticks(*rates.to_sticks(setpoint.body_rates), thrust.to_sticks(setpoint.collective_thrust))
-
-
-def from_sticks(sticks: Sticks, rates: RateMap, thrust: ThrustMap) -> Setpoint:
-    """Return the setpoint that sticks ask for."""
-    return Setpoint(thrust.from_sticks(sticks.throttle), rates.from_sticks(sticks.roll, sticks.pitch, sticks.yaw))
-
 
 def channels(command: Command, rates: RateMap, thrust: ThrustMap, arm_channel: int = FIRST_SWITCH) -> tuple[float, ...]:
     """Return the 16 radio channels of a command.
@@ -196,31 +151,13 @@ def channels(command: Command, rates: RateMap, thrust: ThrustMap, arm_channel: i
 
     Returns:
         (16,) µs in [1000, 2000], not rounded.
-
-    Raises:
-        ValueError: ``arm_channel`` is no switch.
     """
-    check_arm_channel(arm_channel)
-    sticks = to_sticks(command.setpoint, rates, thrust) if command.armed else Sticks(0.0, 0.0, 0.0, 0.0)
-    values = [LOWEST] * CHANNELS
-    for index, stick in ((0, sticks.roll), (1, sticks.pitch), (3, sticks.yaw)):
-        values[index] = CENTRE + (HIGHEST - CENTRE) * stick
-    values[2] = LOWEST + (HIGHEST - LOWEST) * sticks.throttle
-    values[arm_channel] = HIGHEST if command.armed else LOWEST
-    return tuple(values)
-
-
-def check_arm_channel(arm_channel: int) -> None:
-    """Refuse a channel that is no switch.
-
-    Raises:
-        ValueError: It is a stick, or there is none of that index.
-    """
-    if arm_channel not in range(FIRST_SWITCH, CHANNELS):
-        raise ValueError(
-            f"arm_channel={arm_channel}: must be {FIRST_SWITCH} (AUX1) to {CHANNELS - 1} (AUX12); lower ones are the "
-            "sticks."
-        )
+    if not command.armed:
+        return (CENTRE, CENTRE, LOWEST, CENTRE, *[LOWEST] * (CHANNELS - FIRST_SWITCH))
+    roll, pitch, yaw = (CENTRE + (HIGHEST - CENTRE) * stick for stick in rates.to_sticks(command.setpoint.body_rates))
+    throttle = LOWEST + (HIGHEST - LOWEST) * thrust.to_sticks(command.setpoint.collective_thrust)
+    switches = (HIGHEST if index == arm_channel else LOWEST for index in range(FIRST_SWITCH, CHANNELS))
+    return (roll, pitch, throttle, yaw, *switches)
 
 
 def _clamp(value: float, low: float, high: float) -> float:

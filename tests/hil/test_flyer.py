@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import json
 import math
 from dataclasses import replace
@@ -23,7 +22,7 @@ from dreamer_racing.hil.chain import ChainConfig, FlightChain, describe_outputs,
 from dreamer_racing.hil.flyer import check_contract, check_flown_by_betaflight, check_ranges, check_rate_loop
 from dreamer_racing.hil.recording import FILE, Flight, FlightRecorder
 from dreamer_racing.hil.safety_limits import SafetyLimits
-from dreamer_racing.hil.sticks import RateMap, Sticks, ThrustMap, channels, from_sticks, to_sticks
+from dreamer_racing.hil.sticks import RateMap, ThrustMap, channels
 from dreamer_racing.hil.vehicle import GRAVITY, Command, Setpoint, at_rest, hover
 from dreamer_racing.plant.lock_step import LockStep, make_chain
 from dreamer_racing.plant.vehicle import PlantVehicle
@@ -150,7 +149,6 @@ def test_gains_and_motors_may_differ_as_far_as_those_of_training_did(gains, lag,
 
 RATES = RateMap(roll=10.0, pitch=8.0, yaw=4.0)
 THRUST = ThrustMap(mass=0.6, full_thrust=16.0, reference_voltage=15.0, voltage=15.0)
-IDLE_THRUST = 0.055**2 * 16.0 / 0.6  # m/s²
 
 
 def armed(thrust: float = GRAVITY, rates: tuple[float, float, float] = (0.0, 0.0, 0.0)) -> Command:
@@ -184,23 +182,15 @@ def test_hover_of_the_projects_drone():
 
 def test_throttle_of_the_firmware():
     """At 1500 µs real firmware runs its motors at .502."""
-    assert THRUST.from_sticks(0.5) == pytest.approx(0.5026**2 * 16.0 / 0.6, rel=1e-3)
-    assert THRUST.from_sticks(0.0) == THRUST.from_sticks(0.05) == pytest.approx(IDLE_THRUST)
-    assert THRUST.from_sticks(1.0) == pytest.approx(16.0 / 0.6)
+    assert THRUST.to_sticks(0.5026**2 * 16.0 / 0.6) == pytest.approx(0.5, abs=1e-3)
+    assert THRUST.to_sticks(0.055**2 * 16.0 / 0.6) == pytest.approx(0.05), "idle"
+    assert THRUST.to_sticks(16.0 / 0.6) == pytest.approx(1.0)
 
 
 def test_a_flat_battery_needs_more_throttle():
-    low = dataclasses.replace(THRUST, voltage=13.5)
+    low = replace(THRUST, voltage=13.5)
     assert low.to_motor(9.81) == pytest.approx(THRUST.to_motor(9.81) / 0.9)
-    assert low.from_sticks(1.0) == pytest.approx(0.81 * THRUST.from_sticks(1.0))
     assert low.to_sticks(0.9 * 16.0 / 0.6) == 1.0  # more than there is left
-
-
-@given(thrust=st.floats(IDLE_THRUST, 16.0 / 0.6), roll=st.floats(-10, 10), pitch=st.floats(-8, 8), yaw=st.floats(-4, 4))
-def test_sticks_lead_back_to_the_setpoint(thrust, roll, pitch, yaw):
-    setpoint = from_sticks(to_sticks(Setpoint(thrust, np.array([roll, pitch, yaw])), RATES, THRUST), RATES, THRUST)
-    assert setpoint.collective_thrust == pytest.approx(thrust, abs=1e-9)
-    assert setpoint.body_rates == pytest.approx([roll, pitch, yaw], abs=1e-9)
 
 
 @given(
@@ -210,9 +200,10 @@ def test_sticks_lead_back_to_the_setpoint(thrust, roll, pitch, yaw):
     min_check=st.floats(1000, 1200),
     throttle=st.floats(0.21, 1.0),
 )
-def test_thrust_leads_back_to_the_throttle(mass, voltage, idle, min_check, throttle):
-    thrust = ThrustMap(mass, 20.0, 15.0, voltage, idle, min_check)
-    assert thrust.to_sticks(thrust.from_sticks(throttle)) == pytest.approx(throttle, abs=1e-9)
+def test_a_throttle_makes_the_thrust_that_it_is_for(mass, voltage, idle, min_check, throttle):
+    motor = idle + (1 - idle) * (1000 + 1000 * throttle - min_check) / (2000 - min_check)
+    thrust = 20.0 * (voltage / 15.0) ** 2 * motor**2 / mass
+    assert ThrustMap(mass, 20.0, 15.0, voltage, idle, min_check).to_sticks(thrust) == pytest.approx(throttle, abs=1e-9)
 
 
 @given(
@@ -245,42 +236,27 @@ def test_armed_without_thrust_is_low_enough_to_arm():
     assert channels(armed(0.0), RATES, THRUST)[2] == 1000
 
 
-@pytest.mark.parametrize("arm_channel", [-1, 0, 3, 16])
-def test_a_stick_arms_nothing(arm_channel):
-    with pytest.raises(ValueError, match=f"arm_channel={arm_channel}: must be 4"):
-        channels(armed(), RATES, THRUST, arm_channel)
-
-
-@pytest.mark.parametrize("value", [0.0, -1.0, math.nan, math.inf, 573.0])
-@pytest.mark.parametrize("field", ["roll", "pitch", "yaw"])
+@pytest.mark.parametrize(("field", "value"), [("roll", 0.0), ("pitch", math.nan), ("yaw", 573.0)])
 def test_rates_that_are_none(field, value):
     """573 is 10 rad/s, in deg/s."""
     with pytest.raises(ValueError, match=f"RateMap.{field}="):
-        dataclasses.replace(RATES, **{field: value})
+        replace(RATES, **{field: value})
 
 
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
         ({"mass": 0.0}, "ThrustMap.mass=0.0: must be above 0"),
-        ({"mass": math.nan}, "ThrustMap.mass=nan"),
         ({"mass": 600.0}, "ThrustMap.full_thrust=16.0 N: must lift mass=600.0 kg"),
         ({"full_thrust": 4.0}, "ThrustMap.full_thrust=4.0 N: .* all motors together"),
-        ({"full_thrust": -16.0}, "ThrustMap.full_thrust=-16.0"),
-        ({"reference_voltage": 0.0}, "ThrustMap.reference_voltage=0.0"),
         ({"voltage": 3.75}, "ThrustMap.voltage=3.75 V: must be between 7.5 and 22.5 V"),
-        ({"voltage": 0.0}, "ThrustMap.voltage=0.0"),
         ({"idle": 5.5}, "ThrustMap.idle=5.5: must be at least 0 and at most 0.2"),
         ({"min_check": 50.0}, "ThrustMap.min_check=50.0: must be at least 1000"),
     ],
 )
 def test_drones_that_are_none(changes, message):
     with pytest.raises(ValueError, match=message):
-        dataclasses.replace(THRUST, **changes)
-
-
-def test_sticks_have_names():
-    assert to_sticks(Setpoint(0.0, np.array([10.0, 0.0, 0.0])), RATES, THRUST) == Sticks(1.0, 0.0, 0.0, 0.0)
+        replace(THRUST, **changes)
 
 
 # Flights of flyers that need what the IMU tells: told, played back, and cut where it is told no longer.

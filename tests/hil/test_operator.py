@@ -16,7 +16,7 @@ from dreamer_racing.hil.links import LINKS
 from dreamer_racing.hil.operator import (
     DEAD_MAN,
     KILLS,
-    PACKET_SIZE,
+    PACKET,
     KeyboardOperator,
     Operator,
     TimedOperator,
@@ -90,7 +90,7 @@ def test_a_hundred_thousand_damaged_packets_enable_nothing():
     generator = np.random.default_rng(0)
     good = np.frombuffer(encode_operator(1, Operator(False, False)), np.uint8)
     damaged = np.tile(good, (100_000, 1))
-    damaged[np.arange(100_000), generator.integers(0, PACKET_SIZE, 100_000)] ^= generator.integers(
+    damaged[np.arange(100_000), generator.integers(0, PACKET.size, 100_000)] ^= generator.integers(
         1, 256, 100_000, dtype=np.uint8
     )
     assert not any(decode_operator(row.tobytes()) for row in damaged)

@@ -17,7 +17,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from dreamer_racing.hil.attitude import rotation_matrix
-from dreamer_racing.hil.pose import PACKET_SIZE, PosePacket, Received, UdpPose, decode_pose, encode_pose, make_packet
+from dreamer_racing.hil.pose import PACKET, PosePacket, Received, UdpPose, decode_pose, encode_pose, make_packet
 from dreamer_racing.hil.stamping import PoseClock, Stamping, extrapolate
 from dreamer_racing.hil.vehicle import Pose
 
@@ -45,7 +45,7 @@ def sender():
 
 def test_the_layout_is_as_documented():
     data = encode_pose(packet())
-    assert len(data) == PACKET_SIZE == 124
+    assert len(data) == PACKET.size == 124
     assert data[:4] == b"DRP1" and data[4:8] == (7).to_bytes(4, "little")
     assert data[120:] == zlib.crc32(data[:120]).to_bytes(4, "little")
 
@@ -83,12 +83,12 @@ def test_attitudes_come_out_at_unit_length():
 
 
 @settings(max_examples=300)
-@given(data=st.binary(max_size=PACKET_SIZE + 8))
+@given(data=st.binary(max_size=PACKET.size + 8))
 def test_any_bytes_are_no_pose(data):
     assert decode_pose(data) is None  # a right CRC by chance: 2⁻³²
 
 
-@given(position=st.integers(0, PACKET_SIZE - 1), flip=st.integers(1, 255))
+@given(position=st.integers(0, PACKET.size - 1), flip=st.integers(1, 255))
 def test_a_damaged_packet_is_no_pose(position, flip):
     data = bytearray(encode_pose(packet()))
     data[position] ^= flip
@@ -99,7 +99,7 @@ def test_a_hundred_thousand_hostile_packets_are_ignored():
     generator = np.random.default_rng(0)
     good = np.frombuffer(encode_pose(packet()), np.uint8)
     damaged = np.tile(good, (100_000, 1))
-    damaged[np.arange(100_000), generator.integers(0, PACKET_SIZE, 100_000)] ^= generator.integers(
+    damaged[np.arange(100_000), generator.integers(0, PACKET.size, 100_000)] ^= generator.integers(
         1, 256, 100_000, dtype=np.uint8
     )
     assert not any(decode_pose(row.tobytes()) for row in damaged)

@@ -9,11 +9,12 @@ import time
 import pytest
 
 from dreamer_racing.hil.battery import Battery, BatteryConfig, Reading
-from dreamer_racing.hil.links.crsf import CrsfTelemetry, crc8, decode_crsf, encode_crsf
+from dreamer_racing.hil.links.crsf import CrsfTelemetry, crc8, encode_crsf
 from dreamer_racing.hil.links.link import ChannelLink
 from dreamer_racing.hil.sticks import RateMap, ThrustMap
 from dreamer_racing.hil.vehicle import Command, at_rest, hover
 from dreamer_racing.hil.watchdog import Watchdog
+from tests.hil.links.frames import read_channels
 
 ARMED = Command(True, hover())
 
@@ -221,7 +222,6 @@ def test_no_reading_in_flight_raises(voltage, mass):
     thrust = ThrustMap(mass=mass, full_thrust=16.0, reference_voltage=15.0, voltage=16.0)
     link = ChannelLink(Transport(), encode_crsf, RateMap(roll=10.0, pitch=10.0, yaw=4.0), thrust)
     link.set_voltage(voltage)
-    link.thrust.check()
     lifting = 15.0 * math.sqrt(9.81 * mass / 16.0)
     expected = min(max(voltage, 7.5, lifting), 22.5) if math.isfinite(voltage) else 16.0
     assert link.thrust.voltage == pytest.approx(expected, rel=1e-4)
@@ -230,9 +230,7 @@ def test_no_reading_in_flight_raises(voltage, mass):
 
 
 def throttle(link: ChannelLink) -> float:
-    channels = decode_crsf(link.send(Command(True, hover())))
-    assert channels is not None
-    return channels[2]
+    return read_channels("crsf", link.send(Command(True, hover())))[2]
 
 
 def motor(microseconds: float) -> float:

@@ -10,14 +10,14 @@ import pytest
 
 from dreamer_racing.export.onnx_actor import read_contract
 from dreamer_racing.hil.betaflight import Status, check_dump, rate_map, wanted_settings
-from dreamer_racing.hil.betaflight.status import REQUEST, SerialOverTcp
+from dreamer_racing.hil.betaflight.status import REQUEST
 from dreamer_racing.hil.chain import ChainConfig, FlightChain
 from dreamer_racing.hil.flyer import ActorFlyer
 from dreamer_racing.hil.links import LinkConfig, make_link
 from dreamer_racing.hil.links.link import ChannelLink, TransportLink
 from dreamer_racing.hil.links.msp import MspTelemetry, encode_msp
 from dreamer_racing.hil.links.sitl import SitlTransport, encode_sitl
-from dreamer_racing.hil.links.tcp import TcpTransport
+from dreamer_racing.hil.links.tcp import SerialOverTcp
 from dreamer_racing.hil.safety_limits import SafetyLimits
 from dreamer_racing.hil.sticks import ThrustMap
 from dreamer_racing.hil.vehicle import GRAVITY, Command, Setpoint, at_rest
@@ -41,7 +41,7 @@ def radio_link(radio: Radio) -> ChannelLink:
 
 
 def msp_link(firmware: SteppedFirmware) -> ChannelLink:
-    transport = TcpTransport(SerialOverTcp(firmware.firmware.ports.serial))
+    transport = SerialOverTcp(firmware.firmware.ports.serial)
     return ChannelLink(transport, encode_msp, RATES, THRUST, telemetry=MspTelemetry(), request=REQUEST)
 
 

@@ -12,8 +12,6 @@ https://betaflight.com/docs/wiki/guides/current/Arming-Sequence-And-Safety.
 
 from __future__ import annotations
 
-import socket
-import time
 from typing import NamedTuple
 
 STATUS, BOXIDS = 101, 119
@@ -104,67 +102,3 @@ REQUEST = b"$M<" + bytes([0, STATUS, STATUS])
 
 BOXIDS_REQUEST = b"$M<" + bytes([0, BOXIDS, BOXIDS])
 """Request of the list of modes, in the order of the status bits."""
-
-
-class SerialOverTcp:
-    """A non-blocking connection to the first serial port of a firmware on this machine, reopened whenever it closes.
-
-    The firmware takes one connection at a time, and closes another at once.
-
-    Args:
-        port: TCP port.
-        host: Address of this machine.
-    """
-
-    _RETRY_AFTER = 0.5  # s between attempts to connect
-
-    def __init__(self, port: int, host: str = "127.0.0.1") -> None:
-        self._address = (host, port)
-        self._socket: socket.socket | None = None
-        self._next = 0.0  # when to connect next, s of ``time.monotonic``
-
-    def write(self, data: bytes) -> bool:
-        """Write bytes; return whether they were sent."""
-        connection = self._connect()
-        if connection is None:
-            return False
-        try:
-            return connection.send(data) == len(data)
-        except BlockingIOError:
-            return False
-        except OSError:
-            self._disconnect()
-            return False
-
-    def read(self) -> bytes:
-        """Return the received bytes, if any."""
-        if self._socket is None:
-            return b""
-        try:
-            data = self._socket.recv(4096)
-        except BlockingIOError:
-            return b""
-        except OSError:
-            data = b""
-        if not data:
-            self._disconnect()
-        return data
-
-    def close(self) -> None:
-        """Close the connection; may be called twice."""
-        if self._socket is not None:
-            self._socket.close()
-        self._socket = None
-
-    def _connect(self) -> socket.socket | None:
-        if self._socket is None and time.monotonic() >= self._next:
-            self._next = time.monotonic() + self._RETRY_AFTER
-            self._socket = socket.socket(socket.AF_INET, socket.SOCK_STREAM)
-            self._socket.setblocking(False)
-            self._socket.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
-            self._socket.connect_ex(self._address)  # if nobody listens, the first write fails
-        return self._socket
-
-    def _disconnect(self) -> None:
-        self.close()
-        self._next = time.monotonic() + self._RETRY_AFTER

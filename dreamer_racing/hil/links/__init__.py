@@ -17,7 +17,6 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
 
-from dreamer_racing.hil.betaflight.status import SerialOverTcp
 from dreamer_racing.hil.links.crsf import CrsfTelemetry, encode_crsf
 from dreamer_racing.hil.links.link import ChannelLink, Transport, TransportLink
 from dreamer_racing.hil.links.mavlink import MavlinkLink
@@ -34,10 +33,10 @@ from dreamer_racing.hil.links.msp import (
 from dreamer_racing.hil.links.sbus import encode_sbus
 from dreamer_racing.hil.links.serial_port import PROTOCOLS, SerialPort, SerialSettings
 from dreamer_racing.hil.links.sitl import MSP_PORT, RC_PORT, SitlTransport, encode_sitl
-from dreamer_racing.hil.links.tcp import TcpTransport
+from dreamer_racing.hil.links.tcp import SerialOverTcp
 from dreamer_racing.hil.links.telemetry import Telemetry
 from dreamer_racing.hil.links.udp import UdpLink, UdpTransport
-from dreamer_racing.hil.sticks import FIRST_SWITCH, RateMap, ThrustMap, check_arm_channel
+from dreamer_racing.hil.sticks import CHANNELS, FIRST_SWITCH, RateMap, ThrustMap
 from dreamer_racing.settings import check_choice, given
 
 
@@ -64,7 +63,11 @@ class LinkConfig:
     serial_port: int = MSP_PORT  # for `betaflight_sitl`: TCP port of the firmware's MSP
 
     def __post_init__(self) -> None:
-        check_arm_channel(self.arm_channel)
+        if self.arm_channel not in range(FIRST_SWITCH, CHANNELS):
+            raise ValueError(
+                f"arm_channel={self.arm_channel}: must be {FIRST_SWITCH} (AUX1) to {CHANNELS - 1} (AUX12); lower ones "
+                "are the sticks."
+            )
 
 
 def make_link(config: LinkConfig) -> TransportLink:
@@ -141,7 +144,7 @@ def _msp(config: LinkConfig, override: bool = False) -> TransportLink:
     """Make the link to a flight controller whose only receiver is MSP, or whose receiver's sticks MSP overrides."""
     rates, thrust = _maps(config)
     simulated = config.device is None and config.port is not None
-    wire = TcpTransport(SerialOverTcp(_port(config), config.host)) if simulated else _serial_port(config)
+    wire = SerialOverTcp(_port(config), config.host) if simulated else _serial_port(config)
     telemetry = MspTelemetry(G_COUNTS_SITL if simulated else G_COUNTS, override)
     encode, request = (encode_sticks, OVERRIDE_REQUEST) if override else (encode_msp, MSP_REQUEST)
     always = IMU_REQUEST if config.imu else b""

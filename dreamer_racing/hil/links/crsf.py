@@ -1,7 +1,7 @@
 """CRSF (Crossfire, ExpressLRS): the frame RC_CHANNELS_PACKED out, and BATTERY_SENSOR back.
 
-26 bytes: address of the flight controller C8, length 18 of what follows, kind 16, 22 bytes of `packed` channels, and a
-CRC-8 over kind and channels.
+26 bytes: address of the flight controller C8, length 18 of what follows, kind 16, 22 bytes of channels (`sbus`), and
+a CRC-8 over kind and channels.
 
 Betaflight reads 1811 − 172 ticks as 2012 − 988 µs exactly, which is up to 1 µs more than meant, and 0.8 µs at centre.
 
@@ -16,12 +16,10 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from dreamer_racing.hil.links import packed
+from dreamer_racing.hil.links.sbus import pack_channels
 from dreamer_racing.hil.links.telemetry import FrameReader, Telemetry
 
 HEADER = b"\xc8\x18\x16"
-FRAME_SIZE = len(HEADER) + packed.SIZE + 1
-"""Bytes of a frame: 26."""
 ADDRESSES = (0xC8, 0xEA, 0xEC, 0xEE)
 """First bytes of frames: of flight controller, handset, receiver and transmitter module."""
 BATTERY_SENSOR, _BATTERY_PAYLOAD = 0x08, 8
@@ -31,15 +29,8 @@ _POLYNOMIAL = 0xD5  # DVB-S2
 
 def encode_crsf(channels: Sequence[float]) -> bytes:
     """Return the frame of 16 channels in µs."""
-    frame = HEADER + packed.pack(channels)
+    frame = HEADER + pack_channels(channels)
     return frame + bytes([crc8(frame[2:])])
-
-
-def decode_crsf(frame: bytes) -> tuple[float, ...] | None:
-    """Return the 16 channels, in µs, of a frame; None if it is not such a frame, or damaged."""
-    if len(frame) != FRAME_SIZE or not frame.startswith(HEADER) or crc8(frame[2:-1]) != frame[-1]:
-        return None
-    return packed.unpack(frame[len(HEADER) : -1])
 
 
 class CrsfTelemetry(Telemetry):

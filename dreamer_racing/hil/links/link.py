@@ -105,7 +105,7 @@ class TransportLink(ABC):
     def set_voltage(self, voltage: float) -> None:
         """Set the thrust map's voltage, V, or the nearest that it can have (`ThrustMap.at`).
 
-        A reading in flight never raises: one beyond what `ThrustMap.check` allows is clipped, one that is not finite is
+        A reading in flight never raises: one beyond what `ThrustMap` allows is clipped, one that is not finite is
         ignored.
         """
         if self.thrust is not None and self.thrust.voltage != voltage:

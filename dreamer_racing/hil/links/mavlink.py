@@ -24,19 +24,22 @@ from typing import Any
 
 import numpy as np
 
+from dreamer_racing.commands import import_extra
 from dreamer_racing.hil.imu import make_sample
 from dreamer_racing.hil.links.link import Transport, TransportLink
 from dreamer_racing.hil.links.telemetry import Telemetry
-from dreamer_racing.hil.mavlink_messages import import_messages
 from dreamer_racing.hil.sticks import ThrustMap
 from dreamer_racing.hil.vehicle import GRAVITY, Command, Setpoint
 
+SYSTEM, AUTOPILOT = 1, 1
+"""IDs of the vehicle and of its autopilot."""
 IGNORE_ATTITUDE = 128
 """ATTITUDE_TARGET_TYPEMASK: rates and thrust count, the attitude does not."""
 FORCE = 21196.0
 """Second parameter of COMPONENT_ARM_DISARM: disarm even in flight."""
 STANDARD_GRAVITY = 9.80665
 """m/s² per G in SCALED_IMU."""
+FIRST_BATTERY = 0
 UNKNOWN = 65535
 """mV, value of an unknown voltage."""
 _LONGEST = Setpoint(GRAVITY, np.ones(3))  # without zeros, which the wire omits at a message's end
@@ -45,14 +48,21 @@ ARM_TRIES = 5
 not be armed again [choice]."""
 
 
+def import_messages(who: str) -> Any:
+    """Return the module of MAVLink 2's common messages, which ``who`` needs.
+
+    Raises:
+        ImportError: pymavlink is not installed.
+    """
+    return import_extra("pymavlink.dialects.v20.common", "hil", f"{who} needs pymavlink")
+
+
 class MavlinkLink(TransportLink):
     """Sends attitude targets, and arms and disarms.
 
     Args:
         transport: Sends the bytes.
         thrust: Map from motor command to thrust; ``idle`` and ``min_check`` are not used.
-        system: System ID of the vehicle.
-        component: Component ID of its autopilot.
 
     Raises:
         ImportError: pymavlink is not installed.
@@ -60,11 +70,10 @@ class MavlinkLink(TransportLink):
 
     thrust: ThrustMap
 
-    def __init__(self, transport: Transport, thrust: ThrustMap, system: int = 1, component: int = 1) -> None:
-        super().__init__(transport, thrust, MavlinkTelemetry(system))
+    def __init__(self, transport: Transport, thrust: ThrustMap) -> None:
+        super().__init__(transport, thrust, MavlinkTelemetry())
         self._common = import_messages("The link mavlink")
-        self._target = system, component
-        self._sender = self._common.MAVLink(None, system, self._common.MAV_COMP_ID_ONBOARD_COMPUTER)
+        self._sender = self._common.MAVLink(None, SYSTEM, self._common.MAV_COMP_ID_ONBOARD_COMPUTER)
         self._armed_for = 0  # commands in a row
         self._has_armed = False  # whether this link ever armed; it disarms only what it has armed
 
@@ -86,7 +95,7 @@ class MavlinkLink(TransportLink):
         arm = self._common.MAV_CMD_COMPONENT_ARM_DISARM
         return self._pack(
             self._common.MAVLink_command_long_message(
-                *self._target, arm, confirmation, float(armed), force, 0, 0, 0, 0, 0
+                SYSTEM, AUTOPILOT, arm, confirmation, float(armed), force, 0, 0, 0, 0, 0
             )
         )
 
@@ -97,7 +106,7 @@ class MavlinkLink(TransportLink):
         milliseconds = int(1000 * time.monotonic()) % 2**32
         return self._pack(
             self._common.MAVLink_set_attitude_target_message(
-                milliseconds, *self._target, IGNORE_ATTITUDE, [1.0, 0.0, 0.0, 0.0], *rates_frd, thrust
+                milliseconds, SYSTEM, AUTOPILOT, IGNORE_ATTITUDE, [1.0, 0.0, 0.0, 0.0], *rates_frd, thrust
             )
         )
 
@@ -108,18 +117,14 @@ class MavlinkLink(TransportLink):
 
 
 class MavlinkTelemetry(Telemetry):
-    """Reads BATTERY_STATUS (of the first battery), SYS_STATUS and the IMU's messages, by pymavlink.
-
-    Args:
-        system: System ID of the vehicle; messages of others are ignored.
+    """Reads BATTERY_STATUS (of the first battery), SYS_STATUS and the IMU's messages of the vehicle, by pymavlink.
 
     Raises:
         ImportError: pymavlink is not installed.
     """
 
-    def __init__(self, system: int = 1) -> None:
+    def __init__(self) -> None:
         super().__init__()
-        self._system = system
         self._parser = import_messages("The link mavlink").MAVLink(None)
         self._parser.robust_parsing = True  # damaged messages come out as BAD_DATA
 
@@ -128,22 +133,19 @@ class MavlinkTelemetry(Telemetry):
         voltages = []
         for message in self._parser.parse_buffer(data) or []:
             kind = message.get_type()
-            if kind in SAMPLES and message.get_srcSystem() == self._system:
+            if kind == "BAD_DATA":
+                self.rejected += 1
+            elif message.get_srcSystem() != SYSTEM:
+                continue
+            elif kind in SAMPLES:
                 sample = SAMPLES[kind](message)
                 self.rejected += sample is None
                 self.imu_samples += [] if sample is None else [sample]
-            if kind == "BAD_DATA":
-                self.rejected += 1
-            elif message.get_srcSystem() == self._system and kind in VOLTAGES and not _is_another(message):
+            elif kind in VOLTAGES and not (kind == "BATTERY_STATUS" and message.id != FIRST_BATTERY):
                 voltage = VOLTAGES[kind](message)
                 self.rejected += voltage is None
                 voltages += [] if voltage is None else [voltage]
         return voltages
-
-
-def _is_another(message: Any) -> bool:
-    """Return whether a message is of another battery than the first."""
-    return message.get_type() == "BATTERY_STATUS" and message.id != 0
 
 
 def _of_battery_status(message: Any) -> float | None:

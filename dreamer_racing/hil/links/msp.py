@@ -58,8 +58,6 @@ G_COUNTS, G_COUNTS_SITL = 512.0, 256.0
 """Counts of acceleration per 9.81 m/s²: of sensors, and of a firmware that was built for a computer."""
 _IMU = struct.Struct("<6h")
 _STICKS = 4
-FRAME_SIZE = 38
-"""Bytes of a message of 16 channels."""
 
 
 def encode_msp(channels: Sequence[float]) -> bytes:
@@ -72,19 +70,6 @@ def encode_msp(channels: Sequence[float]) -> bytes:
 def encode_sticks(channels: Sequence[float]) -> bytes:
     """Return the message of the four sticks of 16 channels."""
     return encode_msp(channels[:_STICKS])
-
-
-def decode_msp(frame: bytes) -> tuple[float, ...] | None:
-    """Return the channels, in µs, of a message; None if it is not such a message, or damaged."""
-    size = len(frame) - 6
-    if (
-        size < 0
-        or size % 2
-        or not frame.startswith(b"$M<" + bytes([size, SET_RAW_RC]))
-        or _checksum(frame) != frame[-1]
-    ):
-        return None
-    return tuple(float(value) for value in struct.unpack(f"<{size // 2}H", frame[5:-1]))
 
 
 class MspTelemetry(Telemetry):

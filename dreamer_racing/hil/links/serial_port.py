@@ -8,7 +8,7 @@ import time
 from collections.abc import Iterator
 from typing import Any, NamedTuple
 
-from dreamer_racing.commands import install_extra
+from dreamer_racing.commands import import_extra
 
 
 class SerialSettings(NamedTuple):
@@ -134,10 +134,7 @@ class SerialPort:
 
 def open_port(device: str, settings: SerialSettings) -> Any:
     """Return an open port of pyserial; raises as `SerialPort` does."""
-    try:
-        import serial
-    except ImportError as error:
-        raise ImportError(f"A serial link needs pyserial: {install_extra('hil')}.") from error
+    serial = import_extra("serial", "hil", "A serial link needs pyserial")
     if settings.baud <= 0:
         raise ValueError(f"baud={settings.baud}: must be above 0.")
     try:

@@ -16,9 +16,10 @@ import struct
 import time
 from collections.abc import Iterator, Sequence
 
-from dreamer_racing.hil.betaflight.status import NOT_READY, REQUEST, SerialOverTcp
+from dreamer_racing.hil.betaflight.status import NOT_READY, REQUEST
 from dreamer_racing.hil.links.link import ASK_EVERY, Transport
 from dreamer_racing.hil.links.msp import IMU_REQUEST, MspTelemetry
+from dreamer_racing.hil.links.tcp import SerialOverTcp
 
 logger = logging.getLogger(__name__)
 
@@ -78,11 +79,11 @@ class SitlTransport:
         self._channels.discard()
 
     def read(self) -> Iterator[tuple[float, bytes]]:
-        """Yield the bytes from its serial port, with the time now, s (``time.monotonic``)."""
-        if data := self._serial.read():
+        """Yield the bytes from its serial port."""
+        for arrival, data in self._serial.read():
             if self._boots is not None:
                 self._boots.read(data)
-            yield time.monotonic(), data
+            yield arrival, data
 
     def close(self) -> None:
         """Close both transports."""

@@ -1,8 +1,8 @@
 """Commands over UDP: the packet in SI units for a simulated vehicle, and a non-blocking socket.
 
 The packet, little endian, 53 bytes: ``b"DRC1"``, sequence number u32, the sender's ``time.monotonic`` f64 (s), armed u8
-(0 or 1), collective thrust f64 (m/s²), body rates 3 f64 (rad/s), and CRC-32 u32 of all before it. Frames and units are
-those of `Setpoint`.
+(0 or 1), collective thrust f64 (m/s²), body rates 3 f64 (rad/s), and CRC-32 u32 of all before it (`hil.packets`).
+Frames and units are those of `Setpoint`.
 """
 
 from __future__ import annotations
@@ -10,9 +10,7 @@ from __future__ import annotations
 import errno
 import math
 import socket
-import struct
 import time
-import zlib
 from collections.abc import Iterator
 from typing import NamedTuple
 
@@ -21,13 +19,10 @@ import numpy as np
 from dreamer_racing.hil.imu import decode_imu
 from dreamer_racing.hil.links.link import TransportLink
 from dreamer_racing.hil.links.telemetry import Telemetry
+from dreamer_racing.hil.packets import PacketFormat
 from dreamer_racing.hil.vehicle import Command, Setpoint
 
-MAGIC = b"DRC1"
-_BODY = struct.Struct("<4sIdB4d")
-_CHECK = struct.Struct("<I")
-PACKET_SIZE = _BODY.size + _CHECK.size
-"""Bytes of a packet: 53."""
+PACKET = PacketFormat(b"DRC1", "IdB4d")
 _TRANSIENT_ERRORS = {
     errno.EAGAIN,
     errno.ECONNREFUSED,
@@ -49,20 +44,14 @@ class CommandPacket(NamedTuple):
 def encode_command(packet: CommandPacket) -> bytes:
     """Return the bytes of a packet."""
     armed, (thrust, rates) = packet.command
-    numbers = (float(number) for number in (thrust, *rates))
-    body = _BODY.pack(MAGIC, packet.sequence % 2**32, packet.stamp, bool(armed), *numbers)
-    return body + _CHECK.pack(zlib.crc32(body))
+    return PACKET.pack(packet.sequence % 2**32, packet.stamp, bool(armed), thrust, *rates)
 
 
 def decode_command(data: bytes) -> CommandPacket | None:
     """Return a packet's content; None if it has another size or kind, is damaged, or has impossible numbers."""
-    if (
-        len(data) != PACKET_SIZE
-        or data[:4] != MAGIC
-        or _CHECK.unpack_from(data, _BODY.size)[0] != zlib.crc32(data[: _BODY.size])
-    ):
+    if (content := PACKET.unpack(data)) is None:
         return None
-    _, sequence, stamp, armed, thrust, *rates = _BODY.unpack_from(data)
+    sequence, stamp, armed, thrust, *rates = content
     if armed > 1 or thrust < 0 or not all(math.isfinite(number) for number in (stamp, thrust, *rates)):
         return None
     return CommandPacket(sequence, stamp, Command(bool(armed), Setpoint(thrust, np.array(rates))))

@@ -29,7 +29,7 @@ import numpy as np
 
 from dreamer_racing.hil.attitude import turn
 from dreamer_racing.hil.inlet import Inlet
-from dreamer_racing.hil.mavlink_messages import import_messages
+from dreamer_racing.hil.links.mavlink import import_messages
 from dreamer_racing.hil.pose import PosePacket, make_packet, plausible
 from dreamer_racing.hil.pose_sources.messages import SMOOTHING, Measurement, MessagePose
 

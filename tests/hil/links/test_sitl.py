@@ -13,19 +13,16 @@ from operator import xor
 import numpy as np
 import pytest
 
-from dreamer_racing.hil.betaflight.status import BOXIDS_REQUEST, REQUEST, SerialOverTcp
+from dreamer_racing.hil.betaflight.status import BOXIDS_REQUEST, REQUEST
 from dreamer_racing.hil.links import LinkConfig, make_link
-from dreamer_racing.hil.links.crsf import encode_crsf
 from dreamer_racing.hil.links.link import ASK_EVERY, ChannelLink, TransportLink
 from dreamer_racing.hil.links.mavlink import MavlinkLink
-from dreamer_racing.hil.links.msp import IMU_REQUEST, OVERRIDE_REQUEST, MspTelemetry, decode_msp, encode_msp
-from dreamer_racing.hil.links.sbus import encode_sbus
-from dreamer_racing.hil.links.sitl import SitlTransport, encode_sitl
-from dreamer_racing.hil.sticks import RateMap, ThrustMap
+from dreamer_racing.hil.links.msp import IMU_REQUEST, OVERRIDE_REQUEST, MspTelemetry
+from dreamer_racing.hil.links.sitl import SitlTransport
+from dreamer_racing.hil.links.tcp import SerialOverTcp
 from dreamer_racing.hil.vehicle import Command, Setpoint, at_rest, hover
+from tests.hil.links.frames import CHANNEL_LINKS, RATES, RESTING, THRUST, read_words
 
-RATES = RateMap(roll=10.0, pitch=10.0, yaw=4.0)
-THRUST = ThrustMap(mass=0.6, full_thrust=16.0, reference_voltage=15.0, voltage=15.0)
 BOOTGRACE, RXLOSS, THROTTLE = 1 << 9, 1 << 2, 1 << 7
 ARM, ANGLE, OVERRIDE = 1, 1 << 1, 1 << 3
 BOXES = bytes([0, 1, 6, 50])
@@ -182,11 +179,11 @@ def test_beside_a_receiver_the_pilot_arms_and_hands_over(modes: int, flags: int,
 def test_beside_a_receiver_nothing_that_is_sent_could_arm(server: socket.socket) -> None:
     link = make_link(LinkConfig("msp_override", port=server.getsockname()[1], rates=RATES, thrust=THRUST, imu=True))
     first = link.send(Command(True, hover()))
-    assert decode_msp(first[:14]) == (1500.0, 1500.0, pytest.approx(1608.0, abs=20.0), 1500.0)
+    assert read_words(first[5:13]) == [1500, 1500, pytest.approx(1608.0, abs=20.0), 1500]
     assert first[14:] == OVERRIDE_REQUEST + IMU_REQUEST and OVERRIDE_REQUEST.endswith(BOXIDS_REQUEST)
     firmware = server.accept()[0]
     second = link.send(at_rest())
-    assert decode_msp(second[:14]) == (1500.0, 1500.0, 1000.0, 1500.0) and second[14:] == IMU_REQUEST
+    assert read_words(second[5:13]) == [1500, 1500, 1000, 1500] and second[14:] == IMU_REQUEST
     assert link.refusal == "no status was received from it"
     firmware.sendall(frame(119, BOXES) + status(ARM | OVERRIDE))
     deadline = time.monotonic() + 5.0
@@ -220,25 +217,6 @@ class Recorder:
         self.closed = True
 
 
-def read_bits(data: bytes) -> list[float]:
-    """Channels of 11 bits each: one string of bits, in the order in which a wire has them."""
-    bits = "".join(format(byte, "08b")[::-1] for byte in data)
-    ticks = [int(bits[start : start + 11][::-1], 2) for start in range(0, 176, 11)]
-    return [1500 + (tick - 992) * 1000 / 1600 for tick in ticks]
-
-
-def read_words(data: bytes) -> list[float]:
-    return [low + 256 * high for low, high in zip(data[::2], data[1::2], strict=True)]
-
-
-CHANNEL_LINKS = {
-    "crsf": (encode_crsf, lambda data: read_bits(data[3:25])),
-    "sbus": (encode_sbus, lambda data: read_bits(data[1:23])),
-    "msp": (encode_msp, lambda data: read_words(data[5:37])),
-    "betaflight_sitl": (encode_sitl, lambda data: read_words(data[8:40])),
-}
-
-
 @pytest.fixture(params=CHANNEL_LINKS)
 def radio(request):
     """What is sent for a command, as 16 channels in µs."""
@@ -269,21 +247,10 @@ def test_one_axis_of_a_radio(radio, command, channel, value):
     assert radio(command) == pytest.approx(expected, abs=1.0)
 
 
-def test_throttle_of_a_radio(radio):
+def test_throttle_of_a_radio_armed_and_disarmed(radio):
     assert radio(Command(True, Setpoint(16.0 / 0.6, np.zeros(3))))[2] == pytest.approx(2000, abs=1.0)
     assert radio(Command(True, Setpoint(0.0, np.zeros(3))))[2] == pytest.approx(1000, abs=1.0)
-
-
-def test_disarmed_radio(radio):
-    resting = pytest.approx([1500, 1500, 1000, 1500, *[1000] * 12], abs=1.0)
-    assert radio(at_rest()) == radio(turning(1.0, 2.0, 3.0)._replace(armed=False)) == resting
-
-
-def test_the_battery_may_be_read_in_flight():
-    link = ChannelLink(Recorder(), encode_msp, RATES, THRUST)
-    before = read_words(link.send(turning())[5:37])[2]
-    link.thrust = ThrustMap(mass=0.6, full_thrust=16.0, reference_voltage=15.0, voltage=13.5)
-    assert read_words(link.send(turning())[5:37])[2] > before + 60
+    assert radio(at_rest()) == radio(turning(1.0, 2.0, 3.0)._replace(armed=False)) == pytest.approx(RESTING)
 
 
 def messages(data: bytes):
@@ -357,15 +324,12 @@ class Bare(TransportLink):
         return struct.pack("<?4d", command.armed, command.setpoint.collective_thrust, *command.setpoint.body_rates)
 
 
-def test_what_is_dropped_is_counted():
-    link = Bare(Recorder(takes=False))
+def test_what_is_dropped_is_counted_and_closing_closes_the_transport():
+    recorder = Recorder(takes=False)
+    link = Bare(recorder)
     assert [link.send(at_rest()), link.send(turning())] == [b"", b""]
     assert link.dropped == 2
-
-
-def test_closing_closes_the_transport():
-    recorder = Recorder()
-    Bare(recorder).close()
+    link.close()
     assert recorder.closed
 
 

@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import math
 import socket
 import struct
-import subprocess
 import sys
 import time
 import zlib
@@ -15,20 +13,18 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from dreamer_racing.hil.links import LINKS, LinkConfig, make_link, packed
-from dreamer_racing.hil.links.crsf import crc8, decode_crsf, encode_crsf
-from dreamer_racing.hil.links.msp import decode_msp, encode_msp
-from dreamer_racing.hil.links.sbus import SbusFrame, decode_sbus, encode_sbus
+from dreamer_racing.hil.links import LINKS, LinkConfig, make_link
+from dreamer_racing.hil.links.crsf import crc8, encode_crsf
+from dreamer_racing.hil.links.msp import encode_msp
+from dreamer_racing.hil.links.sbus import encode_sbus, pack_channels
 from dreamer_racing.hil.links.sitl import encode_sitl
 from dreamer_racing.hil.links.udp import CommandPacket, UdpLink, UdpTransport, decode_command, encode_command
-from dreamer_racing.hil.sticks import RateMap, ThrustMap
 from dreamer_racing.hil.vehicle import Command, Setpoint, at_rest
+from tests.hil.links.frames import CHANNEL_LINKS, RATES, THRUST, read_channels
 
-finite = st.floats(allow_nan=False, allow_infinity=False)
 
-
-def packet(thrust: float = 9.81, rates: tuple[float, ...] = (1.0, 2.0, 3.0), stamp: float = 2.5) -> CommandPacket:
-    return CommandPacket(7, stamp, Command(True, Setpoint(thrust, np.array(rates))))
+def packet(thrust: float = 9.81) -> CommandPacket:
+    return CommandPacket(7, 2.5, Command(True, Setpoint(thrust, np.array((1.0, 2.0, 3.0)))))
 
 
 @pytest.fixture
@@ -46,28 +42,11 @@ def test_packet_by_hand():
     assert len(encode_command(packet())) == 53
 
 
-@given(st.integers(0, 2**32 - 1), finite, st.booleans(), st.floats(0, 1e9), st.tuples(finite, finite, finite))
-def test_round_trip(sequence, stamp, armed, thrust, rates):
-    decoded = decode_command(
-        encode_command(CommandPacket(sequence, stamp, Command(armed, Setpoint(thrust, np.array(rates)))))
-    )
-    assert (decoded.sequence, decoded.stamp, decoded.command.armed) == (sequence, stamp, armed)
-    assert decoded.command.setpoint.collective_thrust == thrust
-    assert tuple(decoded.command.setpoint.body_rates) == rates
-
-
-@pytest.mark.parametrize(
-    "impossible",
-    [packet(thrust=math.nan), packet(thrust=-0.1), packet(rates=(0.0, math.inf, 0.0)), packet(stamp=math.nan)],
-)
-def test_impossible_numbers(impossible):
-    """Their checksum is right, and they are refused all the same."""
-    assert decode_command(encode_command(impossible)) is None
-
-
-def test_armed_is_yes_or_no():
+def test_impossible_numbers():
+    """Their checksum is right, and they are refused all the same; those that are not finite are in `test_fuzz`."""
+    assert decode_command(encode_command(packet(thrust=-0.1))) is None
     body = bytearray(encode_command(packet())[:-4])
-    body[16] = 2
+    body[16] = 2  # armed is yes or no
     assert decode_command(bytes(body) + struct.pack("<I", zlib.crc32(body))) is None
 
 
@@ -140,20 +119,13 @@ def test_crc_of_its_polynomial():
 )
 def test_ticks(microseconds, tick):
     """The least significant bits of channel 1 come first."""
-    data = packed.pack((microseconds, *CENTRED[1:]))
+    data = pack_channels((microseconds, *CENTRED[1:]))
     assert data[0] | (data[1] & 0b111) << 8 == tick
 
 
-@pytest.mark.parametrize(("tick", "microseconds"), [(172, 988), (992, 1500), (1811, 2012)])
-def test_ends_of_crsf(tick, microseconds):
-    """Its ends are given in whole microseconds."""
-    assert packed.unpack(tick.to_bytes(22, "little"))[0] == pytest.approx(microseconds, abs=0.5)
-
-
-@pytest.mark.parametrize("count", [0, 15, 17])
-def test_sixteen_channels_and_no_others(count):
-    with pytest.raises(ValueError, match=f"{count} channels: a frame has 16"):
-        packed.pack([1500.0] * count)
+def test_sixteen_channels_and_no_others():
+    with pytest.raises(ValueError, match="15 channels: a frame has 16"):
+        pack_channels([1500.0] * 15)
 
 
 def test_sbus_by_hand():
@@ -164,13 +136,6 @@ def test_sbus_by_hand():
     """
     frame = encode_sbus((1000.0, 2000.0, *CENTRED[2:]))
     assert frame == b"\x0f" + b"\xc0\x00\x38" + ALL_992[3:] + b"\x00\x00"
-
-
-@pytest.mark.parametrize(("lost", "failsafe", "flags"), [(True, False, 0x04), (False, True, 0x08), (True, True, 0x0C)])
-def test_sbus_flags(lost, failsafe, flags):
-    frame = encode_sbus(CENTRED, lost, failsafe)
-    assert frame[23] == flags
-    assert decode_sbus(frame) == SbusFrame(CENTRED, lost, failsafe)
 
 
 def test_msp_by_hand():
@@ -192,19 +157,14 @@ def test_sitl_packet():
 
 
 @given(MICROSECONDS)
-def test_round_trips(values):
-    """1 µs in whole microseconds, 5/8 µs in ticks; half of that is lost by rounding."""
-    assert decode_crsf(encode_crsf(values)) == pytest.approx(values, abs=0.3126)
-    assert decode_sbus(encode_sbus(values)).channels == pytest.approx(values, abs=0.3126)
-    assert decode_msp(encode_msp(values)) == pytest.approx(values, abs=0.5001)
-    assert struct.unpack_from("<16H", encode_sitl(values), 8) == pytest.approx(values, abs=0.5001)
+@pytest.mark.parametrize("name", CHANNEL_LINKS)
+def test_a_channel_loses_half_a_step_at_most(name, values):
+    """Of 5/8 µs in ticks, and 1 µs in whole microseconds."""
+    encode, _ = CHANNEL_LINKS[name]
+    assert read_channels(name, encode(values)) == pytest.approx(values, abs=0.5001 if name[0] in "mb" else 0.3126)
 
 
 # Links by name: each is made and heard, and what is missing is named.
-
-
-RATES = RateMap(roll=10.0, pitch=10.0, yaw=4.0)
-THRUST = ThrustMap(mass=0.6, full_thrust=16.0, reference_voltage=15.0, voltage=15.0)
 
 
 def hears_command(data):
@@ -216,9 +176,7 @@ def hears_mavlink(data):
     return len(common.MAVLink(None).parse_buffer(data)) == 1
 
 
-@pytest.mark.parametrize(
-    ("name", "hears"), [("udp", hears_command), ("simulated", hears_command), ("mavlink", hears_mavlink)]
-)
+@pytest.mark.parametrize(("name", "hears"), [("udp", hears_command), ("mavlink", hears_mavlink)])
 def test_links_over_udp(listener, name, hears):
     link = make_link(LinkConfig(name, port=listener.getsockname()[1], rates=RATES, thrust=THRUST))
     sent = link.send(at_rest())
@@ -254,11 +212,10 @@ def test_unknown_links():
         (LinkConfig("mavlink", port=14540), "thrust"),
         (LinkConfig("betaflight_sitl", thrust=THRUST), "rates"),
         (LinkConfig("betaflight_sitl", rates=RATES), "thrust"),
-        *[(LinkConfig(name, rates=RATES, thrust=THRUST), "device") for name in ("crsf", "sbus", "msp", "msp_override")],
-        *[
-            (LinkConfig(name, device="/dev/ttyUSB0", thrust=THRUST), "rates")
-            for name in ("crsf", "sbus", "msp", "msp_override")
-        ],
+        (LinkConfig("crsf", rates=RATES, thrust=THRUST), "device"),
+        (LinkConfig("msp_override", rates=RATES, thrust=THRUST), "device"),
+        (LinkConfig("sbus", device="/dev/ttyUSB0", thrust=THRUST), "rates"),
+        (LinkConfig("msp", device="/dev/ttyUSB0", thrust=THRUST), "rates"),
     ],
 )
 def test_what_is_missing_is_named(config, field):
@@ -266,27 +223,19 @@ def test_what_is_missing_is_named(config, field):
         make_link(config)
 
 
-@pytest.mark.parametrize("port", [0, -1, 65536])
+@pytest.mark.parametrize("port", [0, 65536])
 def test_ports_that_are_none(port):
     with pytest.raises(ValueError, match=f"port={port}: must be at least 1 and at most 65535"):
         make_link(LinkConfig("udp", port=port))
 
 
-def test_a_stick_arms_nothing():
-    with pytest.raises(ValueError, match="arm_channel=2"):
-        LinkConfig("crsf", arm_channel=2)
+@pytest.mark.parametrize("arm_channel", [-1, 3, 16])
+def test_a_stick_arms_nothing(arm_channel):
+    with pytest.raises(ValueError, match=f"arm_channel={arm_channel}: must be 4"):
+        LinkConfig("crsf", arm_channel=arm_channel)
 
 
 def test_without_pymavlink(monkeypatch):
-    monkeypatch.setitem(sys.modules, "pymavlink.dialects.v20", None)
+    monkeypatch.setitem(sys.modules, "pymavlink.dialects.v20.common", None)
     with pytest.raises(ImportError, match=r"pip install .*\[hil\]'"):
         make_link(LinkConfig("mavlink", port=14540, thrust=THRUST))
-
-
-def test_what_flies_needs_neither_torch_nor_the_packages_of_other_links():
-    program = (
-        "import sys, dreamer_racing.hil.links as links; links.make_link(links.LinkConfig('udp', port=9100)).close(); "
-        "print([name for name in ('torch', 'serial', 'pymavlink') if name in sys.modules])"
-    )
-    ended = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
-    assert ended.stdout == "[]\n"

@@ -440,6 +440,6 @@ class TestSerial:
 
 
 def test_missing_pymavlink_is_said(monkeypatch):
-    monkeypatch.setitem(sys.modules, "pymavlink.dialects.v20", None)
+    monkeypatch.setitem(sys.modules, "pymavlink.dialects.v20.common", None)
     with pytest.raises(ImportError, match=r"The pose source mavlink needs pymavlink: .*pip install .*\[hil\]'"):
         MavlinkPose(Given([]))
