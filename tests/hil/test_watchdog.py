@@ -14,7 +14,7 @@ from dreamer_racing.hil.links.link import ChannelLink
 from dreamer_racing.hil.sticks import RateMap, ThrustMap
 from dreamer_racing.hil.vehicle import Command, at_rest, hover
 from dreamer_racing.hil.watchdog import Watchdog
-from tests.hil.links.frames import read_channels
+from tests.hil.links.frames import Recorder, read_channels
 
 ARMED = Command(True, hover())
 
@@ -37,17 +37,6 @@ class Wire:
         if self.breaks:
             raise OSError("the device is gone")
         return b"frame"
-
-    refusal = ""
-
-    def listen(self):
-        return []
-
-    def set_voltage(self, voltage: float) -> None:
-        pass
-
-    def close(self) -> None:
-        pass
 
 
 class Time:
@@ -145,13 +134,9 @@ CONFIG = BatteryConfig(voltage=16.0, tolerance=0.25, smoothing=0.5)
 THRUST = ThrustMap(mass=0.6, full_thrust=16.0, reference_voltage=15.0, voltage=16.0)
 
 
-def test_without_readings_it_is_what_was_set():
-    battery = Battery(CONFIG)
-    assert battery.update(3.0, []) == 16.0 and battery.age == math.inf and battery.readings == 0
-
-
 def test_the_first_reading_counts_whole_and_a_step_comes_through_by_63_per_cent_in_a_time_constant():
     battery = Battery(CONFIG)
+    assert battery.update(0.5, []) == 16.0 and battery.age == math.inf and battery.readings == 0
     assert battery.update(1.0, [Reading(1.0, 15.0)]) == 15.0
     assert battery.update(1.5, [Reading(1.5, 14.0)]) == pytest.approx(14.0 + math.exp(-1.0))
     assert battery.update(9.0, []) == pytest.approx(14.0 + math.exp(-1.0))  # what is old stays
@@ -182,30 +167,14 @@ def test_what_no_battery_is_like_is_refused(numbers):
         BatteryConfig(**numbers)
 
 
-class Transport:
-    """A transport that takes everything, and gives back what was put in."""
-
-    def __init__(self, *arrived: tuple[float, bytes]) -> None:
-        self.arrived = list(arrived)
-
-    def write(self, data: bytes) -> bool:
-        return True
-
-    def read(self):
-        arrived, self.arrived = self.arrived, []
-        return iter(arrived)
-
-    def discard(self) -> None:
-        pass
-
-    def close(self) -> None:
-        pass
+def throttle(link: ChannelLink) -> float:
+    return read_channels("crsf", link.send(Command(True, hover())))[2]
 
 
 def test_a_frame_of_the_flight_controller_changes_the_throttle_by_the_thrust_law():
     """At 14.4 V of 16 the motors' command for the same thrust is 16 / 14.4 as high."""
     frame = bytes.fromhex("c80a08 0090 0000 000000 00")  # 144 decivolts
-    wire = Transport((5.0, frame + bytes([crc8(frame[2:])])))
+    wire = Recorder((5.0, frame + bytes([crc8(frame[2:])])))
     link = ChannelLink(wire, encode_crsf, RateMap(roll=10.0, pitch=10.0, yaw=4.0), THRUST, telemetry=CrsfTelemetry())
     before = throttle(link)
     readings = link.listen()
@@ -215,22 +184,18 @@ def test_a_frame_of_the_flight_controller_changes_the_throttle_by_the_thrust_law
     assert link.listen() == [] and link.rejected == 0
 
 
-@pytest.mark.parametrize("voltage", [0.0, 3.9, 7.4, 8.9, 9.2, 22.6, 1e9, -15.0, math.nan, math.inf, -math.inf])
+@pytest.mark.parametrize("voltage", [0.0, 8.9, 9.2, 22.6, -15.0, math.nan, math.inf])
 @pytest.mark.parametrize("mass", [0.6, 0.2, 1.6])
 def test_no_reading_in_flight_raises(voltage, mass):
     """The reference is 15 V: from 7.5 V, or what just lifts the drone, to 22.5 V."""
     thrust = ThrustMap(mass=mass, full_thrust=16.0, reference_voltage=15.0, voltage=16.0)
-    link = ChannelLink(Transport(), encode_crsf, RateMap(roll=10.0, pitch=10.0, yaw=4.0), thrust)
+    link = ChannelLink(Recorder(), encode_crsf, RateMap(roll=10.0, pitch=10.0, yaw=4.0), thrust)
     link.set_voltage(voltage)
     lifting = 15.0 * math.sqrt(9.81 * mass / 16.0)
     expected = min(max(voltage, 7.5, lifting), 22.5) if math.isfinite(voltage) else 16.0
     assert link.thrust.voltage == pytest.approx(expected, rel=1e-4)
     link.set_voltage(16.0)
     assert link.thrust == thrust
-
-
-def throttle(link: ChannelLink) -> float:
-    return read_channels("crsf", link.send(Command(True, hover())))[2]
 
 
 def motor(microseconds: float) -> float:

@@ -6,8 +6,6 @@ import math
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
 
 from dreamer_racing.envs.drone.parameters import GRAVITY
 from dreamer_racing.hil.links.udp import CommandPacket, encode_command
@@ -63,28 +61,6 @@ def test_silence_cuts_the_motors_at_its_time_until_disarmed_and_armed_again(vehi
     receiver.take(packet(3, armed=False), 2.2)
     receiver.take(packet(4), 2.2)
     assert armed_after(vehicle)
-
-
-def test_what_is_no_command_is_counted_and_keeps_nothing_alive(vehicle: PlantVehicle) -> None:
-    vehicle.reset()
-    receiver = CommandReceiver(vehicle)
-    receiver.take(packet(0, armed=False), 0.0)
-    receiver.take(packet(1), 0.0)
-    good = packet(2, thrust=20.0)
-    damaged = bytes((*good[:20], good[20] ^ 1, *good[21:]))
-    bad = (b"", b"DRC1", good[:-1], good + b"\0", damaged, b"DRP1" + good[4:], packet(2, thrust=float("nan")))
-    for data in bad:
-        assert not receiver.take(data, 0.2)
-    assert receiver.malformed == len(bad) and receiver.received == 2
-    assert receiver.due == pytest.approx(0.25)
-    assert armed_after(vehicle)
-
-
-@settings(max_examples=200, deadline=None)
-@given(data=st.binary(max_size=80))
-def test_no_bytes_upset_it(vehicle: PlantVehicle, data: bytes) -> None:
-    receiver = CommandReceiver(vehicle)
-    assert not receiver.take(data, 0.0) and receiver.malformed == 1
 
 
 def test_lost_and_stale_commands_are_counted_across_the_end_of_the_sequence(vehicle: PlantVehicle) -> None:
@@ -144,12 +120,13 @@ def deliver(number: int = NUMBER, tick: float = 1e-4, **settings: float) -> tupl
     return packets, ages
 
 
-def test_nothing_is_changed_unless_asked_for() -> None:
-    packets, ages = deliver(50)
+@pytest.mark.parametrize(("latency", "offset"), [(0.0, 0.0), (0.012, -1234.5)])
+def test_nothing_is_changed_unless_asked_for(latency: float, offset: float) -> None:
+    packets, ages = deliver(50, latency=latency, clock_offset=offset)
     assert [packet.sequence for packet in packets] == list(range(50))
-    assert max(ages) < 1e-6
+    assert ages == pytest.approx([latency] * 50, abs=1.1e-4)
     for count, packet in enumerate(packets):
-        assert packet.stamp == pytest.approx(count / 200.0)
+        assert packet.stamp == pytest.approx(count / 200.0 + offset)
         for sent, true in zip(packet[2:], pose(0.0)[1:], strict=True):
             assert sent == pytest.approx(true)
 
@@ -160,11 +137,6 @@ def test_loss_is_the_share_that_never_leaves() -> None:
     assert lost == pytest.approx(0.1, abs=4 * math.sqrt(0.1 * 0.9 / NUMBER))
     assert [packet.sequence for packet in packets] == sorted(packet.sequence for packet in packets)
     assert packets[-1].sequence > NUMBER - 50  # gaps in the sequence show it
-
-
-def test_latency_holds_all_back_alike() -> None:
-    _, ages = deliver(500, latency=0.012)
-    assert min(ages) == pytest.approx(0.012, abs=1e-4) and max(ages) == pytest.approx(0.012, abs=1.1e-4)
 
 
 def test_jitter_is_uniform_on_top_of_latency_and_lets_packets_overtake() -> None:
@@ -186,11 +158,6 @@ def test_noise_has_its_deviation_and_keeps_attitudes_at_unit_length() -> None:
     angles = 2.0 * np.arccos(np.clip(np.abs(attitudes @ ATTITUDE), 0.0, 1.0))
     assert np.sqrt((angles**2).mean()) == pytest.approx(0.02 * math.sqrt(3.0), rel=0.06)
     assert all(packet.linear_velocity == pytest.approx((4.0, 5.0, 6.0)) for packet in packets[:20])
-
-
-def test_stamps_are_of_a_clock_of_its_own() -> None:
-    packets, _ = deliver(20, clock_offset=-1234.5)
-    assert packets[7].stamp == pytest.approx(7 / 200.0 - 1234.5)
 
 
 def test_a_seed_makes_it_the_same_again() -> None:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 
 from dreamer_racing.hil.links.crsf import encode_crsf
 from dreamer_racing.hil.links.msp import encode_msp
@@ -37,3 +37,26 @@ CHANNEL_LINKS = {
 
 def read_channels(name: str, frame: bytes) -> Sequence[float]:
     return CHANNEL_LINKS[name][1](frame)
+
+
+class Recorder:
+    """A transport that takes everything, or nothing, and gives what has arrived."""
+
+    def __init__(self, *arrived: tuple[float, bytes], takes: bool = True) -> None:
+        self.arrived, self.takes = list(arrived), takes
+        self.sent: list[bytes] = []
+        self.closed = False
+
+    def write(self, data: bytes) -> bool:
+        self.sent += [data] * self.takes
+        return self.takes
+
+    def read(self) -> Iterator[tuple[float, bytes]]:
+        arrived, self.arrived = self.arrived, []
+        return iter(arrived)
+
+    def discard(self) -> None:
+        pass
+
+    def close(self) -> None:
+        self.closed = True

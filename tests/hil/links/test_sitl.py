@@ -21,7 +21,7 @@ from dreamer_racing.hil.links.msp import IMU_REQUEST, OVERRIDE_REQUEST, MspTelem
 from dreamer_racing.hil.links.sitl import SitlTransport
 from dreamer_racing.hil.links.tcp import SerialOverTcp
 from dreamer_racing.hil.vehicle import Command, Setpoint, at_rest, hover
-from tests.hil.links.frames import CHANNEL_LINKS, RATES, RESTING, THRUST, read_words
+from tests.hil.links.frames import CHANNEL_LINKS, RATES, RESTING, THRUST, Recorder, read_words
 
 BOOTGRACE, RXLOSS, THROTTLE = 1 << 9, 1 << 2, 1 << 7
 ARM, ANGLE, OVERRIDE = 1, 1 << 1, 1 << 3
@@ -40,20 +40,6 @@ def status(modes: int = 0, flags: int = 0) -> bytes:
     return frame(101, head + b"\0" + b"\x1d" + flags.to_bytes(4, "little") + bytes(3))
 
 
-class Sent:
-    """A transport that keeps what was sent."""
-
-    def __init__(self) -> None:
-        self.sent: list[bytes] = []
-
-    def write(self, data: bytes) -> bool:
-        self.sent.append(data)
-        return True
-
-    def close(self) -> None:
-        self.sent.clear()
-
-
 @pytest.fixture
 def server() -> Iterator[socket.socket]:
     with socket.create_server(("127.0.0.1", 0)) as listening:
@@ -70,7 +56,7 @@ def read_all(transport: SitlTransport, wanted: bytes) -> None:
 
 
 def test_no_channels_are_sent_before_the_firmware_says_that_it_has_booted(server: socket.socket) -> None:
-    channels = Sent()
+    channels = Recorder()
     transport = SitlTransport(channels, SerialOverTcp(server.getsockname()[1]))
     assert not transport.write(b"1")
     firmware = server.accept()[0]
@@ -92,7 +78,7 @@ def test_no_channels_are_sent_before_the_firmware_says_that_it_has_booted(server
 
 
 def test_the_imu_is_asked_for_with_each_command(server: socket.socket) -> None:
-    transport = SitlTransport(Sent(), SerialOverTcp(server.getsockname()[1]), imu=True)
+    transport = SitlTransport(Recorder(), SerialOverTcp(server.getsockname()[1]), imu=True)
     transport.write(b"channels")
     firmware = server.accept()[0]
     firmware.settimeout(5.0)
@@ -111,7 +97,7 @@ def test_the_imu_is_asked_for_with_each_command(server: socket.socket) -> None:
 def test_one_whose_serial_port_somebody_else_has_is_sent_channels_after_a_while(
     server: socket.socket, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
-    channels, now = Sent(), [1000.0]
+    channels, now = Recorder(), [1000.0]
     monkeypatch.setattr("dreamer_racing.hil.links.sitl.time.monotonic", lambda: now[0])
     transport = SitlTransport(channels, SerialOverTcp(server.getsockname()[1]))
     transport.write(b"1")
@@ -126,7 +112,7 @@ def test_one_whose_serial_port_somebody_else_has_is_sent_channels_after_a_while(
 def test_where_no_firmware_is_nothing_is_sent_until_one_comes(monkeypatch: pytest.MonkeyPatch) -> None:
     with socket.create_server(("127.0.0.1", 0)) as gone:
         port = gone.getsockname()[1]
-    channels, now = Sent(), [1000.0]
+    channels, now = Recorder(), [1000.0]
     monkeypatch.setattr("dreamer_racing.hil.links.sitl.time.monotonic", lambda: now[0])
     transport = SitlTransport(channels, SerialOverTcp(port))
     for _ in range(40):
@@ -198,23 +184,6 @@ def test_beside_a_receiver_nothing_that_is_sent_could_arm(server: socket.socket)
 
 
 HOVER_THROTTLE = 1604.45  # µs, see tests/hil/test_flyer.py
-
-
-class Recorder:
-    """A transport that takes everything, or nothing."""
-
-    def __init__(self, takes: bool = True):
-        self.takes, self.data, self.closed = takes, b"", False
-
-    def write(self, data):
-        self.data += data * self.takes
-        return self.takes
-
-    def discard(self):
-        pass
-
-    def close(self):
-        self.closed = True
 
 
 @pytest.fixture(params=CHANNEL_LINKS)
@@ -339,5 +308,5 @@ def test_numbers_that_are_none(setpoint):
     recorder = Recorder()
     with pytest.raises(ValueError, match="an armed command must be finite"):
         Bare(recorder).send(Command(True, setpoint))
-    assert recorder.data == b""
+    assert recorder.sent == []
     assert Bare(recorder).send(Command(False, setpoint)) == bytes(33)
