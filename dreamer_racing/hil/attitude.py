@@ -41,11 +41,7 @@ def turn(attitude: np.ndarray, rotation: np.ndarray) -> np.ndarray:
 def rotation_between(first: np.ndarray, second: np.ndarray) -> np.ndarray:
     """Return the rotation vector (3,), rad, body frame, that turns one attitude into another, the short way round.
 
-    The inverse of `turn`: the logarithm of first⁻¹ second. It is the same for q and −q.
-
-    Args:
-        first: (4,) wxyz, unit length.
-        second: (4,) wxyz, unit length.
+    The inverse of `turn`: the logarithm of first⁻¹ second, each (4,) wxyz of unit length. It is the same for q and −q.
     """
     cosine, *vector = product(conjugate(first), second)  # cosine of half the angle, and its sine times the axis
     axis = np.array(vector)

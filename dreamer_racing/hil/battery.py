@@ -53,9 +53,6 @@ class Battery:
     The first plausible reading is taken unfiltered, later ones pass the low-pass. Without readings the voltage keeps
     its last value, initially that of the configuration.
 
-    Args:
-        config: Expected voltage, tolerance and smoothing.
-
     Attributes:
         voltage: V, now.
         readings: Number of plausible readings so far.

@@ -26,7 +26,6 @@ class NoseCamera:
 
     Attributes:
         backend: The one in use.
-        camera: As given.
 
     Raises:
         ValueError: There is no such back end.

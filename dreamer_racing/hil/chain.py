@@ -105,9 +105,9 @@ class FlightChain:
 
     Args:
         flyer: Chooses the setpoints.
-        track: Track to fly.
+        track: To fly.
         config: All other settings.
-        camera: Renders the flyer's images; None if it needs none.
+        camera: None if the flyer needs none.
 
     Raises:
         ValueError: The latency is out of range, the camera's frame rate does not fit the flyer's rate, or the lift is

@@ -126,7 +126,7 @@ def check(config: HilConfig) -> None:
     """Refuse settings that contradict each other.
 
     Raises:
-        ValueError: the message names the field and what is allowed.
+        ValueError: The message names the field and what is allowed.
     """
     check_settings(config)
     wanted = [name for name in ("actor", "replay", "report") if getattr(config, name) is not None]
@@ -161,11 +161,7 @@ def check(config: HilConfig) -> None:
 
 
 def check_read(config: HilConfig) -> None:
-    """Refuse settings that the chosen mode, actor, link or pose source does not use.
-
-    Raises:
-        ValueError: the message names the setting and what it is for.
-    """
+    """Refuse settings that the chosen mode, actor, link or pose source does not use, and say what they are for."""
     default = vars(HilConfig())
     given = {name: value for name, value in vars(config).items() if value != default[name]}
     if config.actor is None:
@@ -340,11 +336,7 @@ def battery_config(config: HilConfig) -> BatteryConfig | None:
 
 
 def check_battery(config: HilConfig, thrust: ThrustMap) -> None:
-    """Refuse a tolerance that accepts voltages beyond the thrust map's range, as nothing can be refused in flight.
-
-    Raises:
-        ValueError: The message names the setting and the voltage.
-    """
+    """Refuse a tolerance that accepts voltages beyond the thrust map's range, as nothing can be refused in flight."""
     battery = battery_config(config)
     for voltage in () if battery is None else battery.limits:
         try:

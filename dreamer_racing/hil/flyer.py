@@ -21,15 +21,10 @@ TOLERANCE = 0.1
 
 
 class Flyer(Protocol):
-    """Chooses a setpoint at each tick.
+    """Chooses a setpoint at each tick."""
 
-    Attributes:
-        rate: Hz, of ticks.
-        camera: The camera it sees through; None: it needs no image.
-    """
-
-    rate: float
-    camera: Camera | None
+    rate: float  # Hz, of ticks
+    camera: Camera | None  # that it sees through; None: it needs no image
 
     def reset(self) -> None:
         """Begin a flight with empty memory."""
@@ -96,12 +91,9 @@ def trained_track(contract: dict[str, Any]) -> Track:
 
 
 def check_contract(contract: dict[str, Any], track: Track, rate: float | None = None) -> str | None:
-    """Refuse an actor that was trained for another track, rate or image size.
+    """Refuse an actor that was trained for another track, rate (Hz; None: its own) or image size.
 
-    Args:
-        contract: The actor's contract.
-        track: The track to fly; its geometry must be that of the contract, its name may differ.
-        rate: Hz of the loop; None for the actor's own.
+    The track's geometry must be that of the contract, its name may differ.
 
     Returns:
         What was not compared, because an older contract lacks it, in words; None if everything was.
@@ -134,7 +126,7 @@ def check_contract(contract: dict[str, Any], track: Track, rate: float | None = 
 
 
 def check_rate_loop(contract: dict[str, Any], vehicle: str, force: bool) -> str | None:
-    """Refuse an actor that was trained with another rate loop than the vehicle has.
+    """Refuse an actor that was trained with another rate loop than the vehicle has, unless ``force``.
 
     Args:
         contract: The actor's contract.
@@ -157,18 +149,9 @@ def check_rate_loop(contract: dict[str, Any], vehicle: str, force: bool) -> str 
 
 
 def check_flown_by_betaflight(contract: dict[str, Any], link: str, force: bool) -> str | None:
-    """Refuse an actor that was not trained with Betaflight's rate loop, for a link to a Betaflight.
+    """Refuse an actor that was not trained with Betaflight's rate loop, for a link to a Betaflight, unless ``force``.
 
-    Args:
-        contract: The actor's contract.
-        link: Name of the link.
-        force: Whether to fly it anyway.
-
-    Returns:
-        What differs, in words, if forced; None if nothing does, or an older contract lacks the rate loop.
-
-    Raises:
-        ValueError: It was trained with another one and ``force`` is false; the message names both.
+    Returns and raises as `check_rate_loop`; a contract that lacks the rate loop is not compared.
     """
     trained = _trained_loop(contract)
     if trained is None or trained["kind"] == "betaflight":
@@ -185,11 +168,6 @@ def _trained_loop(contract: dict[str, Any]) -> dict[str, Any] | None:
 
 
 def _refuse_loop(words: str, remedy: str, force: bool) -> str:
-    """Return a note of what differs if ``force``, else refuse it.
-
-    Raises:
-        ValueError: ``force`` is false.
-    """
     if force:
         return f"{words}; it flies anyway (force=true)"
     raise ValueError(
@@ -198,7 +176,6 @@ def _refuse_loop(words: str, remedy: str, force: bool) -> str:
 
 
 def _name_loop(kind: str) -> str:
-    """Return a kind of rate loop in words."""
     return {"proportional": "a proportional rate loop", "betaflight": "a Betaflight's rate loop"}.get(kind, kind)
 
 
@@ -227,13 +204,8 @@ def _rate_loop_mismatch(trained: dict[str, Any], there: QuadrotorParameters) -> 
 def check_ranges(contract: dict[str, Any], limits: SafetyLimits, user_limits: Collection[str] = ()) -> list[str]:
     """Refuse an actor whose action range exceeds the safety limits, which would clip its actions.
 
-    Args:
-        contract: The actor's contract.
-        limits: Safety limits.
-        user_limits: Names of limits set by the user; these may clip, which is reported.
-
     Returns:
-        What these limits clip, in words.
+        What limits that the user has set clip, in words.
 
     Raises:
         ValueError: A limit not set by the user clips; the message names it, both values, and what to set.

@@ -34,6 +34,8 @@ RANDOM = 4.0
 RANDOM_HOLD = 0.05, 0.15
 """s, shortest and longest of these steps [choice]."""
 
+HEIGHT = 0.3
+"""m of the hover above the start [choice]."""
 KP, KD, KA, KYAW = 3.0, 3.0, 6.0, 2.0
 """Gains of the hover, in 1/s², 1/s, 1/s and 1/s: slow compared with any usable rate loop [choice]."""
 SIDEWAYS = 3.0
@@ -81,22 +83,15 @@ def _draw(time: float, seed: int) -> Iterator[tuple[float, float, float]]:
 class IdentificationFlyer:
     """A `Flyer` that hovers above its start, and makes the steps of `make_schedule`.
 
-    Args:
-        height: Height of the hover above the start, m.
-        seed: Seed of the random steps.
-
     Attributes:
-        rate: Hz.
-        camera: None: it needs no image.
         duration: Length of the whole flight, s.
     """
 
     rate = RATE
     camera: Camera | None = None
 
-    def __init__(self, height: float = 0.3, seed: int = 0) -> None:
-        self._steps = make_schedule(seed)
-        self._height = height
+    def __init__(self) -> None:
+        self._steps = make_schedule()
         self.duration = self._steps[-1].end + SETTLE
         self.reset()
 
@@ -108,7 +103,7 @@ class IdentificationFlyer:
         """Return the setpoint of the hover, plus the step that is due."""
         turned = rotation_matrix(pose.attitude)
         if self._began is None:
-            self._began, self._place = pose.time, pose.position + np.array((0.0, 0.0, self._height))
+            self._began, self._place = pose.time, pose.position + np.array((0.0, 0.0, HEIGHT))
             self._forward = turned[:2, 0] / max(float(np.linalg.norm(turned[:2, 0])), 1e-6)
         elapsed = pose.time - self._began
         wanted = KP * (self._place - pose.position) - KD * pose.linear_velocity

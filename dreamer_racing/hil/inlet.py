@@ -48,7 +48,7 @@ class UdpInlet:
     used.
 
     Args:
-        port: Port to listen on; 0 picks a free one.
+        port: To listen on; 0 picks a free one.
         host: Address to listen on; the default accepts datagrams from this machine only.
 
     Attributes:
@@ -86,11 +86,7 @@ class UdpInlet:
 
 
 def bind(host: str, port: int) -> socket.socket:
-    """Return a non-blocking UDP socket bound to an address.
-
-    Raises:
-        OSError: The address cannot be bound; the message names host and port.
-    """
+    """Return a non-blocking UDP socket bound to an address; an error names it, and what would help."""
     listening = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
     try:
         listening.bind((host, port))

@@ -46,7 +46,7 @@ ENDING = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGQUIT, signal.S
 
 
 class Clock(Protocol):
-    """A clock to read and to wait on; tests use their own."""
+    """A clock to read and to wait on; a plant in lock step has its own."""
 
     def now(self) -> float:
         """Return the time, s, of a clock that never jumps."""
@@ -124,14 +124,13 @@ class FlightLoop:
         chain: Computes the command of each tick.
         poses: Source of poses.
         operator: Source of the operator's enable and kill.
-        link: Link to the vehicle.
+        link: To the vehicle.
         rate: Hz.
-        recorder: Records the flight; None: it is not recorded.
+        recorder: None: the flight is not recorded.
         watchers: Called after each tick with its outputs, to display them.
         clock: None: the machine's.
 
     Attributes:
-        statistics: Timings of ticks.
         flew: Whether the vehicle was armed.
     """
 

@@ -8,7 +8,6 @@ from typing import ClassVar, NamedTuple
 
 from dreamer_racing.hil import attitude
 from dreamer_racing.hil.safety_limits import Vector
-from dreamer_racing.hil.velocity import GAP
 
 
 class _Mark(NamedTuple):
@@ -37,20 +36,16 @@ class Odometer:
 
     _start: ClassVar[Vector] = (0.0, 0.0, 0.0)
 
-    def __init__(self, window: float, gap: float = GAP) -> None:
+    def __init__(self, window: float, gap: float = math.inf) -> None:
         self._window, self._gap = window, gap
         self._marks: deque[_Mark] = deque()
 
     def mismatch(self, time: float, place: Vector, rate: Vector) -> float | None:
-        """Add a pose newer than the last; return the difference of the mean velocities over the window, m/s.
-
-        Args:
-            time: s.
-            place: Position, m.
-            rate: Reported velocity, m/s.
+        """Add a pose newer than the last: its time, s, position, m, and reported velocity, m/s.
 
         Returns:
-            None until the poses since the first one, or since a gap, span the window.
+            The difference of the mean velocities over the window, m/s; None until the poses since the first one, or
+            since a gap, span it.
         """
         marks = self._marks
         last = marks[-1] if marks else None

@@ -95,18 +95,11 @@ def plausible(*vectors: np.ndarray) -> bool:
 
 
 class UdpPose:
-    """Receives poses on a UDP socket, each with the kernel's receive timestamp.
-
-    Args:
-        port: Port to listen on; 0 picks a free one.
-        host: Address to listen on; the default accepts poses from this machine only.
+    """Receives poses by a `UdpInlet`, whose arguments it takes, each with the kernel's receive timestamp.
 
     Attributes:
         address: Host and port that it listens on.
         rejected: See `PoseSource`.
-
-    Raises:
-        OSError: The port is in use, or may not be used; the message names it.
     """
 
     def __init__(self, port: int, host: str = "127.0.0.1") -> None:

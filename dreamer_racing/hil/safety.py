@@ -82,11 +82,7 @@ class Verdict(NamedTuple):
 class Safety:
     """Decides at each tick of the loop whether motors may turn and what is sent; it never raises after construction.
 
-    Args:
-        limits: Its thresholds.
-
     Attributes:
-        limits: As given.
         state: The present state.
 
     Raises:

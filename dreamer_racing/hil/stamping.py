@@ -86,12 +86,7 @@ class PoseClock:
 
 
 def extrapolate(pose: Pose, time: float) -> Pose:
-    """Extrapolate a pose to a time, with constant velocity and body rates.
-
-    Args:
-        pose: The measured pose.
-        time: s, by the loop's clock; if before the pose's own time, the pose is returned unchanged.
-    """
+    """Extrapolate a pose to a time, s, with constant velocity and body rates; unchanged if that is not later."""
     elapsed = time - pose.time
     if elapsed <= 0.0:
         return pose

@@ -50,12 +50,7 @@ class VelocityEstimator:
         self._velocity: Velocity | None = None
 
     def update(self, time: float, position: np.ndarray, attitude: np.ndarray) -> Velocity | None:
-        """Add a pose, and return the vehicle's velocity and body rates.
-
-        Args:
-            time: s, when the pose was measured.
-            position: (3,) m, world; finite.
-            attitude: (4,) wxyz, unit length; of either sign.
+        """Add a pose: when it was measured, s, position (3,), m, and attitude (4,) wxyz of unit length and either sign.
 
         Returns:
             None for the first pose, and after a gap, a jump or a step back in time, where estimation starts anew.

@@ -173,11 +173,7 @@ def _memory_file() -> int:
 
 
 def _start_server(memory: int, listening: socket.socket) -> subprocess.Popen[bytes]:
-    """Start the serving process, and wait until it is ready.
-
-    Raises:
-        OSError: It does not start.
-    """
+    """Start the serving process, and wait until it is ready."""
     shared = (memory, listening.fileno())
     # Run by path, so that it imports nothing of the flight; -P, because files beside this one shadow standard modules.
     command = [sys.executable, "-P", os.path.abspath(__file__), *map(str, shared)]
@@ -356,9 +352,7 @@ class _Server(ThreadingHTTPServer):
 def serve(memory: int, listening: int) -> None:
     """Serve the page until standard input closes, which happens when the flight's process ends for any reason.
 
-    Args:
-        memory: Descriptor of the frame's file.
-        listening: Descriptor of the listening socket.
+    Both arguments are descriptors: of the frame's file, and of the listening socket.
     """
     import PIL.Image  # noqa: F401  # what is missing is to be missed now
 

@@ -108,14 +108,7 @@ class Simulated(NamedTuple):
 
 
 class Model:
-    """Simulates the stretches of a recording with candidates.
-
-    Args:
-        nominal: The drone that candidates are variations of; its `betaflight` is set.
-        recorded: The recording.
-        parts: S stretches of T ms.
-        candidates: C, simulated in parallel.
-    """
+    """Simulates S stretches of T ms of a recording with C candidates in parallel, which are variations of a drone."""
 
     def __init__(
         self, nominal: QuadrotorParameters, recorded: Recorded, parts: Sequence[slice], candidates: int
@@ -219,11 +212,8 @@ def by_name(candidates: Tensor) -> dict[str, Tensor]:
 def fit(recorded: Recorded, nominal: QuadrotorParameters) -> Fit:
     """Fit the parameters of a recording's drone.
 
-    Each parameter has a prior, so that one that the recording does not determine stays near its initial value.
-
-    Args:
-        recorded: The recording; `Recorded.check` refuses unsuitable ones.
-        nominal: The initial drone, whose `betaflight` is set.
+    Each parameter has a prior, so that one that the recording does not determine stays near its initial value, that of
+    the nominal drone. `Recorded.check` refuses unsuitable recordings.
 
     Raises:
         ValueError: The drone has no `betaflight`, or there is no stretch that was measured throughout.

@@ -46,10 +46,7 @@ CONVENTIONS = {"2026.6": PacketConvention((0, 1, 2, 3), 1.0), "before": PacketCo
 
 
 def convention_of(release: str) -> PacketConvention:
-    """Return the packet conventions of a release.
-
-    Args:
-        release: Its number, such as 4.6.0, 2025.12 or 2026.12.0-alpha, or ``before`` for any before 2026.6.
+    """Return the packet conventions of a release: 4.6.0, 2025.12, 2026.12.0-alpha, or ``before`` for any before 2026.6.
 
     Raises:
         ValueError: It is not the number of a release.
@@ -63,13 +60,7 @@ def convention_of(release: str) -> PacketConvention:
 
 
 def encode_state(pose: Pose, specific_force: np.ndarray, convention: PacketConvention) -> bytes:
-    """Return the state packet for the firmware.
-
-    Args:
-        pose: Pose of the vehicle.
-        specific_force: (3,) m/s², body frame: +9.81 upwards at rest.
-        convention: The firmware's packet conventions.
-    """
+    """Return the state packet for the firmware; specific force: (3,) m/s², body frame, +9.81 upwards at rest."""
     x, y, z = pose.body_rates
     rates = (x, -y, convention.yaw_rate_sign * z)
     pressure = 101325.0 * (1.0 - 2.25577e-5 * pose.position[2]) ** 5.25588  # Pa, standard atmosphere
@@ -102,9 +93,6 @@ class BetaflightSitl:
         received: Number of motor packets.
         malformed: Number of messages that were not motor packets.
         failsafe: Decides whether motors may turn.
-
-    Raises:
-        ValueError: ``firmware`` is not a release.
     """
 
     def __init__(

@@ -31,9 +31,6 @@ class Delivery:
 class PoseDelivery:
     """Delays pose packets until they are due.
 
-    Args:
-        delivery: Sampling, delay, loss and noise.
-
     Attributes:
         sent: Number of packets that were sent.
         dropped: Number of packets that were lost.

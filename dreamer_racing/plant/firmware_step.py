@@ -32,18 +32,10 @@ _PATIENCE = 20.0  # s for a step; it takes 0.1 ms
 
 
 class SteppedFirmware:
-    """A firmware in simulated time; a context manager that starts and stops it.
-
-    Args:
-        program: As returned by `find_firmware`.
-        settings: Lines for its CLI.
-        step: s of simulated time per state packet.
+    """A `Firmware` in simulated time, which has its arguments; a context manager starts and stops it.
 
     Attributes:
         firmware: The process.
-
-    Raises:
-        OSError: It does not start.
     """
 
     def __init__(self, program: Path, settings: Sequence[str], step: float = 0.001) -> None:
@@ -114,9 +106,6 @@ class SteppedFirmware:
 class Radio:
     """A `Transport` of channels to a firmware, which can be disconnected.
 
-    Args:
-        firmware: The receiving firmware.
-
     Attributes:
         disconnected: Whether it is disconnected, so that packets are lost.
     """
@@ -147,9 +136,9 @@ class FirmwareStep(LockStep):
 
     Args:
         vehicle: The drone.
-        firmware: A firmware that was started, and has not flown since.
-        link: Link to the firmware.
-        delivery: Sampling, delay, loss and noise of poses.
+        firmware: One that was started, and has not flown since.
+        link: To the firmware.
+        delivery: Of its poses.
 
     Attributes:
         disarmed_at: When its motors first stopped after they had turned, s of physics; None: never.

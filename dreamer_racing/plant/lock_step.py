@@ -16,7 +16,7 @@ from dreamer_racing.hil.operator import Operator
 from dreamer_racing.hil.pose import Received, decode_pose
 from dreamer_racing.hil.recording import FlightRecorder
 from dreamer_racing.hil.vehicle import Command
-from dreamer_racing.plant.commands import TIMEOUT, CommandReceiver
+from dreamer_racing.plant.commands import CommandReceiver
 from dreamer_racing.plant.delivery import Delivery
 from dreamer_racing.plant.process import Plant
 from dreamer_racing.plant.vehicle import PlantVehicle
@@ -33,8 +33,7 @@ class LockStep:
 
     Args:
         vehicle: The drone.
-        delivery: Sampling, delay, loss and noise of its poses.
-        failsafe: s without a command after which the plant cuts its motors.
+        delivery: Of its poses.
 
     Attributes:
         plant: The drone, with its controls and pose delivery.
@@ -42,8 +41,8 @@ class LockStep:
         killed: Whether the operator kills; settable.
     """
 
-    def __init__(self, vehicle: PlantVehicle, delivery: Delivery | None = None, failsafe: float = TIMEOUT) -> None:
-        self.plant = Plant(vehicle, CommandReceiver(vehicle, failsafe), delivery or Delivery(), self._deliver)
+    def __init__(self, vehicle: PlantVehicle, delivery: Delivery | None = None) -> None:
+        self.plant = Plant(vehicle, CommandReceiver(vehicle), delivery or Delivery(), self._deliver)
         self.enable_after, self.killed = ENABLE_AFTER, False
         self.poses, self.operator = _Poses(), _Operator(self)
         self._sequence = 0

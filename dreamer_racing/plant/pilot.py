@@ -25,11 +25,7 @@ class PilotFlyer:
         track: To fly.
         preset: Vehicle model that the pilot assumes.
         rate: Hz, of its setpoints.
-        limits: Limits of the racing line; None for the pilot's own.
-
-    Attributes:
-        rate: As given.
-        camera: None: it needs no image.
+        limits: Of the racing line; None for the pilot's own.
     """
 
     camera: Camera | None = None

@@ -73,8 +73,6 @@ class Plant:
     Attributes:
         commander: Address from which the last datagram came; None before the first.
         time: s, to which physics has advanced.
-        vehicle: The drone.
-        controls: Receives the messages that control it.
         late: Number of events that were more than `LATE` behind the clock.
         latest: s, largest such delay.
     """
@@ -154,7 +152,7 @@ def fly_in_real_time(
 
     Args:
         plant: The plant.
-        incoming: Socket of datagrams for it.
+        incoming: Of datagrams for it.
         stop: Ends the flight on request.
         speed: s of physics per s of the clock.
         duration: s of physics.
@@ -176,15 +174,7 @@ def fly_in_real_time(
 def fly_in_lock_step(
     plant: Plant, incoming: socket.socket, stop: GracefulExit, period: float, duration: float = math.inf
 ) -> None:
-    """Fly without a clock: only commands advance the physics, each by one period.
-
-    Args:
-        plant: The plant.
-        incoming: Socket of commands for it.
-        stop: Ends the flight on request.
-        period: s of physics per command.
-        duration: s of physics.
-    """
+    """Fly without a clock: only commands advance the physics, each by one ``period`` in s, for ``duration`` s of it."""
     while not stop.requested and plant.time < duration - _ROUNDING:
         if select.select([incoming], [], [], _PATIENCE)[0]:
             for data in _drain(plant, incoming):
@@ -205,11 +195,7 @@ def _drain(plant: Plant, incoming: socket.socket) -> list[bytes]:
 
 
 def check_process(options: ProcessOptions) -> None:
-    """Refuse options that exclude each other.
-
-    Raises:
-        ValueError: The message names the settings.
-    """
+    """Refuse options that exclude each other, and name them."""
     incoming, outgoing = "command_port", ["pose_port"]
     if options.betaflight is not None:
         convention_of(options.betaflight)
@@ -258,13 +244,7 @@ def open_sockets(options: ProcessOptions) -> Sockets:
 
 
 def start_firmware(named: str, options: ProcessOptions, sockets: Sockets, settings: Sequence[str]) -> Firmware:
-    """Set up a firmware and start it, in real time.
-
-    Args:
-        named: Its program, or ``auto``, see `find_firmware`.
-        options: Its ports and, if given, its release.
-        sockets: Opened for these options.
-        settings: Lines for its CLI.
+    """Set up a firmware with lines for its CLI and start it, in real time; ``named`` is its program or ``auto``.
 
     Raises:
         ValueError: It is of another release than ``betaflight=``.
@@ -295,17 +275,9 @@ def run(
     sockets: Sockets,
     firmware: Firmware | None = None,
 ) -> Plant:
-    """Fly until SIGINT, SIGTERM or the end of the duration, and log a line on what happened.
+    """Fly until SIGINT, SIGTERM or the end of the duration, log a line on what happened, and return the plant.
 
-    Args:
-        vehicle: The drone.
-        delivery: Sampling, delay, loss and noise of its poses.
-        options: By which clock it flies, and by which firmware.
-        sockets: Opened for these options; they are closed at the end.
-        firmware: One that was started for it; it is stopped at the end.
-
-    Returns:
-        The plant that has flown.
+    The sockets, opened for these options, are closed at the end, and a firmware that was started for it is stopped.
     """
     controls: Controls = CommandReceiver(vehicle, options.failsafe)
     release = options.betaflight if firmware is None else firmware.release

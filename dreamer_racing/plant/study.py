@@ -62,11 +62,11 @@ def study(
 
     Args:
         make_flyer: Makes the flyer; called once in each process, so it must be picklable.
-        track: Track of all flights.
+        track: Of all flights.
         preset: Physics of the vehicle before it is changed.
-        flights: Number of flights of each value, with different noise.
+        flights: Of each value, with different noise.
         sweeps: Names in `SWEEPS`.
-        processes: Number of parallel processes.
+        processes: That fly in parallel.
     """
     jobs = [(sweep, value, seed) for sweep in sweeps for value in SWEEPS[sweep] for seed in range(flights)]
     with ProcessPoolExecutor(

@@ -78,8 +78,7 @@ class PlantVehicle:
         mismatch: Differences of this drone from it.
 
     Attributes:
-        track: The track.
-        parameters: Parameters of this drone.
+        parameters: Of this drone.
         control_dt: Control step of the preset, s.
         time: Physics time since construction, s; a reset does not change it.
         armed: Whether motors may turn, by the command now in effect.
@@ -88,10 +87,6 @@ class PlantVehicle:
         crash_description: The same in words, with its time and whether the drone was disarmed then.
         gates_passed: Number of gates passed in order since it was last on the stand.
         lap_times: s, of the laps since then.
-
-    Raises:
-        ValueError: Unknown preset.
-        TrackError: Unknown or broken track.
 
     Example:
         >>> from dreamer_racing.hil.vehicle import hover

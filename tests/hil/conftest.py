@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import os
 import socket
 import time
+import tty
 from collections.abc import Iterator
 from contextlib import closing
 
@@ -28,3 +30,13 @@ def kernel_stamps() -> Iterator[None]:
         else:
             assert RECEIVED_AT is None, "the kernel does not say when datagrams arrive"
         yield  # the inlet asks as long as the test runs
+
+
+@pytest.fixture
+def wire() -> Iterator[tuple[int, str]]:
+    """The far end of a serial line, and the path of the near one."""
+    far, near = os.openpty()
+    tty.setraw(near)
+    yield far, os.ttyname(near)
+    for descriptor in (far, near):
+        os.close(descriptor)

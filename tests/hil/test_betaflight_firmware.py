@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import socket
 import stat
 import threading
@@ -104,8 +103,3 @@ def test_a_status_is_read_and_said_in_words() -> None:
     assert FlightControllerStatus(0, 0, 29).words == ""
     for size in range(len(STATUS_4_6) - 4):
         assert read_status(STATUS_4_6[:size]) is None
-
-
-def test_the_library_is_part_of_what_ships() -> None:
-    source = Path(firmwares.__file__).with_name("simulated_time.c")
-    assert source.is_file() and os.access(source, os.R_OK)

@@ -20,7 +20,7 @@ from dreamer_racing.envs.simulator.scene import Camera
 from dreamer_racing.envs.tracks import Track, load_track
 from dreamer_racing.hil.battery import BatteryConfig, Reading
 from dreamer_racing.hil.camera import NoseCamera
-from dreamer_racing.hil.chain import LIFT, ChainConfig, FlightChain, Inputs, describe_outputs, read_inputs
+from dreamer_racing.hil.chain import LIFT, ChainConfig, FlightChain, Inputs, Outputs, first_difference
 from dreamer_racing.hil.flyer import ActorFlyer, Flyer
 from dreamer_racing.hil.loop import DISARM_SECONDS, ENDING
 from dreamer_racing.hil.operator import Operator
@@ -134,9 +134,7 @@ def test_a_shipped_agent_flies_by_its_images_and_its_flight_plays_back_bit_for_b
     again = chain_of(ActorFlyer(AGENTS / "circle"), plant, laps=1)
     flight = Flight(tmp_path)
     assert flight.whole and len(flight.ticks) > 50
-    for tick in flight.ticks:
-        outputs = again.tick(read_inputs(tick["in"]))
-        assert json.loads(json.dumps(describe_outputs(outputs))) == tick["out"]
+    assert first_difference(again, flight.ticks) is None
     again.close()
 
 
@@ -161,10 +159,11 @@ def test_the_battery_is_heard_in_flight_reckoned_with_and_played_back(tmp_path):
     with FlightRecorder(tmp_path / FILE, {}) as recorder:
         plant.fly(flying, 50.0, 2.0, recorder)
     assert flying.battery.implausible == 1 and 14.7 < plant.reckoned[-1] < plant.reckoned[0] == 16.0
-    again = chain()
     ticks = Flight(tmp_path).ticks
     assert [tick["out"]["voltage"] for tick in ticks] == plant.reckoned
-    assert all(again.tick(read_inputs(tick["in"])).voltage == tick["out"]["voltage"] for tick in ticks)
+    assert first_difference(chain(), ticks) is None
+    ticks[7]["out"]["voltage"] = np.nextafter(ticks[7]["out"]["voltage"], 0.0)
+    assert first_difference(chain(), ticks).startswith("tick 7: voltage was "), "bit for bit"
 
 
 def test_nothing_is_armed_without_leave():
@@ -174,17 +173,7 @@ def test_nothing_is_armed_without_leave():
     assert not any(command.armed for _, command in plant.sent)
 
 
-def test_lost_poses_are_held_then_cut_within_200_ms():
-    plant = Watched(CIRCLE)
-
-    poll = plant.poses.poll
-    plant.poses.poll = lambda: poll() if plant.elapsed <= 2.0 else []
-    assert fly_hovering(plant).startswith("cut: ")
-    last_armed = max(moment for moment, command in plant.sent if command.armed)
-    assert 2.05 < last_armed < 2.2
-
-
-@pytest.mark.parametrize("phase", np.arange(0.005, 0.04, 0.01).round(3).tolist())
+@pytest.mark.parametrize("phase", [0.005, 0.035])
 def test_poses_are_lost_to_cut_within_200_ms_at_25_hz_by_an_actor_that_takes_30_ms(phase):
     """Whenever in a tick the last one was measured; what is cut does not wait for the actor."""
     plant = Watched(CIRCLE)
@@ -426,36 +415,31 @@ def test_what_speaks_to_the_loop_and_breaks_in_flight_ends_it_as_any_other(part,
     assert sum(said in line for line in caplog.messages) == 1
 
 
-def test_a_link_that_takes_no_command_cuts_and_its_flight_plays_back(tmp_path):
-    class Clogged(Watched):
-        def send(self, command):
-            return b"" if self.elapsed > 1.5 else super().send(command)
+class Clogged(Watched):
+    def send(self, command):
+        return b"" if self.elapsed > 1.5 else super().send(command)
 
-    plant = Clogged(CIRCLE)
+
+class Refusing(Watched):
+    @property
+    def refusal(self):
+        return "" if self.elapsed < 1.5 else "the pilot flies it"
+
+
+@pytest.mark.parametrize(
+    ("kind", "words", "after"),
+    [
+        (Clogged, "cut: the link has accepted no command for 0.16 s", 0.0),
+        (Refusing, "cut: the flight controller refuses: the pilot flies it", 0.75),
+    ],
+)
+def test_a_link_that_takes_no_command_or_is_refused_cuts_and_its_flight_plays_back(kind, words, after, tmp_path):
+    plant = kind(CIRCLE)
     with FlightRecorder(tmp_path / FILE, {}) as recorder:
-        ended = plant.fly(chain_of(Hover(), plant), 50.0, 30.0, recorder)
-    assert ended.startswith("cut: the link has accepted no command for 0.16 s")
+        assert plant.fly(chain_of(Hover(), plant), 50.0, 30.0, recorder) == words
+    assert max(at for at, command in plant.sent if command.armed) == pytest.approx(1.5 + after, abs=0.03)
     again = chain_of(Hover(), plant)
-    for tick in Flight(tmp_path).ticks:
-        assert describe_outputs(again.tick(read_inputs(tick["in"])))["state"] == tick["out"]["state"]
-    assert again.safety.state is State.CUT
-
-
-def test_a_flight_controller_that_takes_it_back_cuts_and_its_flight_plays_back(tmp_path):
-    class Refusing(Watched):
-        @property
-        def refusal(self):
-            return "" if self.elapsed < 1.5 else "the pilot flies it"
-
-    plant = Refusing(CIRCLE)
-    with FlightRecorder(tmp_path / FILE, {}) as recorder:
-        ended = plant.fly(chain_of(Hover(), plant), 50.0, 30.0, recorder)
-    assert ended == "cut: the flight controller refuses: the pilot flies it"
-    last = max(at for at, command in plant.sent if command.armed)
-    assert last == pytest.approx(1.5 + 0.75, abs=0.03)
-    again = chain_of(Hover(), plant)
-    for tick in Flight(tmp_path).ticks:
-        assert describe_outputs(again.tick(read_inputs(tick["in"])))["state"] == tick["out"]["state"]
+    assert first_difference(again, Flight(tmp_path).ticks) is None
     assert again.safety.state is State.CUT
 
 
@@ -477,7 +461,12 @@ def test_until_it_moves_a_vehicle_is_lifted_and_its_flyer_begun_anew(lift):
 
     flyer, plant = Noted(), Watched(CIRCLE)
     config = ChainConfig(SafetyLimits.of_track(CIRCLE, arm_time=0.02), arm=True, lift=lift)
-    plant.fly(make_chain(flyer, plant.vehicle, config), flyer.rate, 1.5)
+    chain, shown = make_chain(flyer, plant.vehicle, config), list[Outputs]()
+    tick = chain.tick
+    chain.tick = lambda inputs: shown.append(tick(inputs)) or shown[-1]
+    plant.fly(chain, flyer.rate, 1.5)
+    wanted = {outputs.setpoint.collective_thrust for outputs in shown if outputs.setpoint is not None}
+    assert wanted == {14.0}, "what the flyer wants is shown also when the lift is sent"
     armed = [(moment, command.setpoint) for moment, command in plant.sent if command.armed]
     turning = next(index for index, (_, setpoint) in enumerate(armed) if setpoint.body_rates.any())
     if not lift:
@@ -564,19 +553,6 @@ def test_a_second_flight_is_lifted_from_one_weight_again():
     assert first == pytest.approx(second) and first[1] == pytest.approx(GRAVITY, rel=0.01) and first[-1] > 11.0
 
 
-def test_what_the_flyer_wants_is_shown_also_when_it_is_lifted():
-    class Turn(Hover):
-        def act(self, pose, image, target_gate):
-            return Setpoint(14.0, np.array([0.0, 1.0, 0.0]))
-
-    plant, shown = Watched(CIRCLE), []
-    chain = chain_of(Turn(), plant)
-    tick = chain.tick
-    chain.tick = lambda inputs: shown.append(tick(inputs)) or shown[-1]
-    plant.fly(chain, Hover.rate, 1.0)
-    assert {outputs.setpoint.collective_thrust for outputs in shown if outputs.pose is not None} == {14.0}
-
-
 @pytest.mark.parametrize("changed", [{"thrust": 0.87}, {"mass": 1.1}, {"thrust": 1.2}, {"delay": 0.06}])
 def test_another_vehicle_than_believed_is_lifted_too(changed):
     plant = Watched(CIRCLE, **changed)
@@ -631,12 +607,6 @@ def test_a_lift_that_lifts_nothing_or_is_clipped_is_refused(lift, limits):
 def test_a_latency_that_is_no_time_is_refused(latency):
     with pytest.raises(ValueError, match=f"latency={latency!r}: must be (a number, )?at least 0 and at most 1"):
         FlightChain(Hover(), CIRCLE, ChainConfig(SafetyLimits.of_track(CIRCLE), latency=latency), None)
-
-
-def test_what_does_not_lift_off_does_not_spin_for_ever():
-    plant = Watched(CIRCLE, mass=1.3, thrust=0.5)
-    assert fly_hovering(plant).startswith("cut: no rise was measured within limits.lift_time=0.9 s: it is stuck, or")
-    assert 1.4 < max(moment for moment, command in plant.sent if command.armed) < 1.6
 
 
 def test_the_actor_forgets_until_the_vehicle_moves():

@@ -162,10 +162,10 @@ def test_a_velocity_along_the_wrong_axis_is_off_by_the_diagonal():
 
 
 def test_after_a_gap_it_begins_anew():
-    odometer = Odometer(0.075)
+    odometer = Odometer(0.075, gap=0.1)
     for step in range(6):
         odometer.mismatch(0.04 * step, (0.0, 0.0, 0.0), (0.0, 0.0, 0.0))
-    assert odometer.mismatch(0.2 + GAP + 0.01, (9.0, 0.0, 0.0), (0.0, 0.0, 0.0)) is None
+    assert odometer.mismatch(0.2 + 0.1 + 0.01, (9.0, 0.0, 0.0), (0.0, 0.0, 0.0)) is None
 
 
 def test_a_lie_is_forgotten_once_it_is_behind_the_window():

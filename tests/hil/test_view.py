@@ -12,6 +12,7 @@ import sys
 import time
 import urllib.error
 import urllib.request
+from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 
@@ -92,10 +93,7 @@ def test_the_image_is_enlarged_and_the_right_way_up(view):
     assert image.size == (512, 512)
     red, blue = image.getpixel((256, 200)), image.getpixel((256, 300))
     assert red == pytest.approx((255, 0, 0), abs=8) and blue == pytest.approx((0, 0, 255), abs=8)
-
-
-def test_an_image_need_neither_be_square_nor_in_one_piece(view):
-    wide = np.zeros((20, 30, 4), np.uint8)[::-1, :, :3]
+    wide = np.zeros((20, 30, 4), np.uint8)[::-1, :, :3]  # neither square nor in one piece
     wide[:, :10] = (0, 255, 0)
     view.show(outputs(wide))
     image = Image.open(io.BytesIO(get(view, "image.jpg")))
@@ -132,12 +130,9 @@ def test_other_addresses_are_not_there(view):
 
 
 def test_it_listens_on_loopback_only(view):
-    port = int(view.address.rstrip("/").rpartition(":")[2])
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
-        try:
-            probe.connect(("192.0.2.1", 9))  # sends nothing; says by which address one would go out
-        except OSError:
-            pytest.skip("this machine has no other interface")
+    port, own = int(view.address.rstrip("/").rpartition(":")[2]), "127.0.0.1"
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe, suppress(OSError):
+        probe.connect(("192.0.2.1", 9))  # sends nothing; says by which address one would go out
         own = probe.getsockname()[0]
     if own.startswith("127."):
         pytest.skip("this machine has no other interface")
@@ -307,7 +302,6 @@ def test_a_pass_has_a_time_and_an_offset():
         (at(0, -0.1, 0.8, 1.35), at(1, 0.1, 0.8, 1.35)),  # beside the opening
         (at(0, -0.1, 0, 2.1), at(1, 0.1, 0, 2.1)),  # over it
         (at(0, 4.9, 0, 1.35), at(1, 5.1, 0, 1.35)),  # the second first
-        (at(0, 0.1, 0, 1.35), at(1, 0.3, 0, 1.35)),  # behind it all the time
     ],
 )
 def test_what_is_no_pass(poses):

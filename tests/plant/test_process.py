@@ -230,8 +230,6 @@ def test_nothing_but_a_command_makes_a_lock_step(fresh: PlantVehicle, incoming: 
         ({"betaflight": "4.6", "lock_step": True}, "betaflight=4.6: it needs the wall clock"),
         ({"firmware": "auto", "speed": 2.0}, "firmware=auto: it needs the wall clock"),
         ({"firmware": "auto", "state_port": 9002}, "motor_port and state_port are both 9002"),
-        ({"betaflight": "before", "lock_step": True}, "wall clock"),
-        ({"betaflight": "before", "speed": 2.0}, "wall clock"),
         ({"lock_step": True, "speed": 2.0}, "no effect with lock_step=true"),
     ],
 )
@@ -240,7 +238,7 @@ def test_what_excludes_each_other_is_refused(options: dict[str, object], message
         check_process(ProcessOptions(**options))
 
 
-@pytest.mark.parametrize("options", [{"speed": 0.0}, {"failsafe": 0.0}, {"pose_port": 0}, {"command_port": 70000}])
+@pytest.mark.parametrize("options", [{"speed": 0.0}, {"pose_port": 0}])
 def test_impossible_numbers_are_refused(options: dict[str, float]) -> None:
     with pytest.raises(ValueError, match=f"{next(iter(options))}=.*must be at least"):
         check_settings(ProcessOptions(**options))

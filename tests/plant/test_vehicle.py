@@ -10,7 +10,6 @@ import torch
 
 from dreamer_racing.envs.drone.parameters import GRAVITY, PRESETS, without_randomisation
 from dreamer_racing.envs.race.gates import CrashCause
-from dreamer_racing.envs.race.pilot import ScriptedPilot
 from dreamer_racing.envs.simulator.mujoco_cpu import MujocoSimulator
 from dreamer_racing.envs.tracks import load_track
 from dreamer_racing.hil.vehicle import Command, Setpoint, at_rest, hover
@@ -209,20 +208,6 @@ def test_it_flies_as_the_simulator_in_which_policies_learn(preset: str) -> None:
     assert vehicle.pose().attitude == pytest.approx(simulator.state.attitude[0].numpy(), abs=2e-3)
 
 
-@pytest.mark.slow
-def test_the_scripted_pilot_flies_a_lap_on_it() -> None:
-    vehicle = PlantVehicle("circle", "easy", Mismatch(mass=1.05))
-    pilot, own = ScriptedPilot("circle", "easy"), PRESETS["easy"]
-    while not vehicle.lap_times and vehicle.time < 6.0:
-        state = (torch.tensor(values, dtype=torch.float32).unsqueeze(0) for values in vehicle.pose()[1:])
-        action = pilot.act(*state, torch.tensor([vehicle.gates_passed % 4]))[0].double().numpy()
-        thrust = own.collective_thrust_scale * (1.0 + float(action[0]))
-        vehicle.command(armed(thrust, tuple(action[1:] * own.body_rate_max)))
-        vehicle.advance(own.control_dt)
-    assert vehicle.crash is CrashCause.NONE and vehicle.gates_passed == 4
-    assert 2.5 < vehicle.lap_times[0] < 4.0  # the line's own is about 2.7 s
-
-
 def test_a_crash_ends_it_until_it_is_put_back() -> None:
     vehicle = flying()
     vehicle.command(armed(20.0))
@@ -239,13 +224,6 @@ def test_a_crash_ends_it_until_it_is_put_back() -> None:
     vehicle.command(armed(GRAVITY))
     vehicle.advance(1.0)
     assert not vehicle.on_stand and vehicle.pose().position == pytest.approx(START, abs=0.01)
-
-
-def test_falling_because_it_was_disarmed_is_said() -> None:
-    vehicle = flying()
-    vehicle.command(at_rest())
-    vehicle.advance(1.0)
-    assert vehicle.crash is CrashCause.GROUND and vehicle.crash_description.endswith(", when disarmed")
 
 
 @pytest.mark.parametrize("preset", ["easy", "faithful", "betaflight"])
@@ -353,12 +331,7 @@ def test_what_ends_at_once_is_said_and_repeats():
 
 
 @pytest.mark.slow
-def test_the_pilot_finishes_through_the_rate_loop_of_a_betaflight():
-    flown = fly(PilotFlyer(load_track("circle"), "betaflight"), "circle", "betaflight", "mass", 1.0, 0)
-    assert flown.finished and flown.gates == 12 and 2.0 < flown.lap_time < 6.0
-
-
-@pytest.mark.slow
-def test_the_pilot_finishes_with_ten_percent_more_mass():
-    flown = fly(PilotFlyer(load_track("circle"), "faithful"), "circle", "faithful", "mass", 1.1, 0)
+@pytest.mark.parametrize(("preset", "mass"), [("betaflight", 1.0), ("faithful", 1.1)])
+def test_the_pilot_finishes_through_the_rate_loop_of_a_betaflight_or_with_more_mass(preset: str, mass: float) -> None:
+    flown = fly(PilotFlyer(load_track("circle"), preset), "circle", preset, "mass", mass, 0)
     assert flown.finished and flown.gates == 12 and 2.0 < flown.lap_time < 6.0

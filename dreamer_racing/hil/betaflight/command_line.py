@@ -24,7 +24,7 @@ class CommandLine:
         patience: s to wait for an answer.
 
     Raises:
-        OSError: No firmware answers at the port.
+        OSError: No firmware answers at the port, or, from each method, it does not answer any more.
     """
 
     def __init__(self, port: int, patience: float = 30.0) -> None:
@@ -41,20 +41,12 @@ class CommandLine:
                     raise  # else try again: a ``#`` sent while the firmware boots is lost
 
     def execute(self, line: str) -> str:
-        """Type a line; return the answer, without echo and prompt.
-
-        Raises:
-            OSError: The firmware does not answer.
-        """
+        """Type a line; return the answer, without echo and prompt."""
         answer = self._read_to_prompt(line.encode("ascii") + b"\n").decode("utf-8", errors="replace")
         return answer.replace("\r", "").removeprefix(line).strip()
 
     def type_all(self, lines: list[str]) -> dict[str, str]:
-        """Type lines other than comments; return the refused ones, with the firmware's messages.
-
-        Raises:
-            OSError: The firmware does not answer.
-        """
+        """Type lines other than comments; return the refused ones, with the firmware's messages."""
         refused = {}
         for line in lines:
             if line and not line.startswith("#") and (found := _REFUSED.search(self.execute(line))):

@@ -91,8 +91,6 @@ class Firmware:
         release: As it reports, such as "4.6.0".
         refused: Lines that it refused, usually as unknown, with its messages.
         dump: Its answer to ``dump all`` after setup.
-        ports: Its ports.
-        step: As given.
 
     Raises:
         OSError: It does not start or answer, or there is no C compiler.
@@ -114,11 +112,7 @@ class Firmware:
             raise
 
     def start(self) -> None:
-        """Start the firmware, which boots, and does not arm until it has received its vehicle's state for a while.
-
-        Raises:
-            OSError: The program cannot be run.
-        """
+        """Start the firmware, which boots, and does not arm until it has received its vehicle's state for a while."""
         self._run(self.step)
 
     def stop(self) -> None:

@@ -88,16 +88,13 @@ def rate_map(contract: dict[str, Any]) -> RateMap:
 
 
 def wanted_settings(contract: dict[str, Any], link: str) -> list[Setting]:
-    """Return all settings that an actor needs, in the order in which to type them.
-
-    Args:
-        contract: As `read_contract` returns it.
-        link: One of `LINKS`.
+    """Return all settings that an actor of a contract needs for one of the `LINKS`, in the order in which to type them.
 
     Raises:
         ValueError: There is no such link; or as `rate_map`.
     """
-    return [*_receiver(link), *_switches(link), *_MASTER, *_PROFILE, *_rates(contract)]
+    switches = _ARMED_BY_PILOT if link == "msp_override" else _ARMED_BY_LINK
+    return [*_receiver(link), *switches, *_MASTER, *_PROFILE, *_rates(contract)]
 
 
 def print_settings(contract: dict[str, Any], link: str) -> list[str]:
@@ -136,12 +133,7 @@ def check_dump(text: str, contract: dict[str, Any], link: str) -> list[Finding]:
 
 
 def require_dump(path: Path, contract: dict[str, Any], link: str) -> int:
-    """Refuse a flight controller whose settings do not fit an actor; return how many settings were compared.
-
-    Args:
-        path: File with the output of ``dump all`` or ``diff all``.
-        contract: As `read_contract` returns it.
-        link: One of `LINKS`.
+    """Refuse a flight controller whose dump, as in `check_dump`, does not fit an actor; return how many were compared.
 
     Raises:
         ValueError: Settings differ or are missing, and the message has a line for each; or as `check_dump`.
@@ -232,11 +224,6 @@ def _receiver(link: str) -> list[Setting]:
         return [rx_serial, rx_msp, _MSP_RATE]
     # The one that is off comes first: the firmware keeps one receiver, not always the last set.
     return [rx_msp, rx_serial, Setting("serialrx_provider", link.upper(), "the protocol of the link")]
-
-
-def _switches(link: str) -> tuple[Setting, ...]:
-    """Return the settings of the switches for arming and flight modes."""
-    return _ARMED_BY_PILOT if link == "msp_override" else _ARMED_BY_LINK
 
 
 def _rates(contract: dict[str, Any]) -> list[Setting]:

@@ -19,30 +19,18 @@ ASK_EVERY = 5
 
 
 class Transport(Protocol):
-    """Sends bytes to a vehicle, and receives those that come back."""
+    """Sends bytes to a vehicle, and receives those that come back; raises `OSError` only if the device is gone."""
 
     def write(self, data: bytes) -> bool:
-        """Send bytes without blocking; return whether all of them were accepted.
-
-        Raises:
-            OSError: The device is gone; transient errors are not raised.
-        """
+        """Send bytes without blocking; return whether all of them were accepted."""
         ...
 
     def discard(self) -> None:
-        """Discard bytes that were written but not sent yet.
-
-        Raises:
-            OSError: The device is gone.
-        """
+        """Discard bytes that were written but not sent yet."""
         ...
 
     def read(self) -> Iterator[tuple[float, bytes]]:
-        """Yield the received bytes, as `Inlet.read` does.
-
-        Raises:
-            OSError: The device is gone.
-        """
+        """Yield the received bytes, as `Inlet.read` does."""
         ...
 
     def close(self) -> None:
@@ -83,11 +71,7 @@ class TransportLink(ABC):
         return "" if self._telemetry is None else self._telemetry.refusal(self._armed)
 
     def listen(self) -> list[Reading]:
-        """Return the battery voltages received since the last call, oldest first, without blocking.
-
-        Raises:
-            OSError: The device is gone.
-        """
+        """Return the battery voltages received since the last call, oldest first, without blocking."""
         if self._telemetry is None:
             return []
         readings = []
@@ -152,9 +136,7 @@ class ChannelLink(TransportLink):
     Args:
         transport: Sends the bytes.
         encode_channels: Encodes 16 channels, in µs, in the protocol's format.
-        rates: Map from sticks to body rates.
-        thrust: Map from throttle to thrust.
-        arm_channel: Index of the switch that arms, see `channels`.
+        rates, thrust, arm_channel: See `channels`.
         telemetry: See `TransportLink`.
         request: Telemetry request, sent with the first of every `ASK_EVERY` commands.
         always: Request sent with every command.

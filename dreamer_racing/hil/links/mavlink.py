@@ -60,9 +60,7 @@ def import_messages(who: str) -> Any:
 class MavlinkLink(TransportLink):
     """Sends attitude targets, and arms and disarms.
 
-    Args:
-        transport: Sends the bytes.
-        thrust: Map from motor command to thrust; ``idle`` and ``min_check`` are not used.
+    Of the thrust map ``idle`` and ``min_check`` are not used.
 
     Raises:
         ImportError: pymavlink is not installed.

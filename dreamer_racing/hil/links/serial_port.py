@@ -68,15 +68,12 @@ class SerialPort:
 
         If not, or if more than a `BACKLOG` waits, the waiting bytes are old: they are discarded, so that the next
         command is received at once.
-
-        Raises:
-            OSError: The device is gone.
         """
         descriptor = self._port.fileno()
         waiting = self._waiting()
         stuck = waiting > BACKLOG * len(data) or 0 < self._left <= waiting
         if stuck:
-            self._discard_output()
+            self.discard()
         self._left = len(data) if stuck else 0
         try:
             # Not pyserial's own write, which retries until the buffer has room.
@@ -86,23 +83,20 @@ class SerialPort:
         except OSError as error:
             raise OSError(f"device={self._device}: it is gone: {error.strerror}.") from error
         if written < len(data):
-            self._discard_output()
+            self.discard()
         return written == len(data) and not stuck
 
     def discard(self) -> None:
-        """Discard bytes that wait to be sent, so that the next command is received at once.
+        """Discard bytes that wait to be sent, so that the next command is received at once."""
+        import termios
 
-        Raises:
-            OSError: The device is gone.
-        """
-        self._discard_output()
+        try:
+            self._port.reset_output_buffer()
+        except termios.error as error:  # not an OSError
+            raise OSError(f"device={self._device}: it is gone: {error}.") from error
 
     def read(self) -> Iterator[tuple[float, bytes]]:
-        """Yield the bytes in the buffer, if there are any, with the time now, s (``time.monotonic``).
-
-        Raises:
-            OSError: The device is gone.
-        """
+        """Yield the bytes in the buffer, if there are any, with the time now, s (``time.monotonic``)."""
         try:
             data = self._port.read(self._port.in_waiting)
         except OSError as error:
@@ -118,14 +112,6 @@ class SerialPort:
             if error.errno in (errno.ENOTTY, errno.EINVAL):  # the driver does not report it
                 return 0
             raise OSError(f"device={self._device}: it is gone: {error.strerror}.") from error
-
-    def _discard_output(self) -> None:
-        import termios
-
-        try:
-            self._port.reset_output_buffer()
-        except termios.error as error:  # not an OSError
-            raise OSError(f"device={self._device}: it is gone: {error}.") from error
 
     def close(self) -> None:
         """Close the port."""

@@ -60,10 +60,6 @@ def decode_command(data: bytes) -> CommandPacket | None:
 class UdpTransport:
     """Sends datagrams to one address, and receives its replies.
 
-    Args:
-        host: Name or address.
-        port: Port to send to.
-
     Raises:
         OSError: There is no such host; the message names it.
     """
@@ -143,9 +139,6 @@ class UdpLink(TransportLink):
         host: Name or address.
         port: Where it listens.
         imu: Whether to receive IMU samples.
-
-    Raises:
-        OSError: There is no such host.
 
     Example:
         >>> link = UdpLink("127.0.0.1", 9100)

@@ -24,16 +24,6 @@ from tests.hil.links.frames import RATES, RESTING, THRUST, read_channels, read_w
 MSP = PROTOCOLS["msp"]
 
 
-@pytest.fixture
-def wire():
-    """The far end of a wire, and the path of the near one."""
-    far, near = os.openpty()
-    tty.setraw(near)
-    yield far, os.ttyname(near)
-    for descriptor in (far, near):
-        os.close(descriptor)
-
-
 def read(descriptor: int, size: int) -> bytes:
     data = b""
     while len(data) < size and select.select([descriptor], [], [], 5.0)[0]:

@@ -210,17 +210,6 @@ def test_an_autopilot_may_begin_anew_after_a_silence(listening):
     assert [clock.read(packet) is not None for packet in received] == [True] * 3
 
 
-def test_arrival_is_the_kernels_time(listening, kernel_stamps):
-    one = listening()
-    before = time.monotonic()
-    one._socket.sendto(pack(odometry()), one.inlet.address)
-    after = time.monotonic()
-    time.sleep(0.05)  # the loop is busy
-    (received,) = one.source.poll()
-    assert before - 2e-3 < received.time < after + (2e-3 if sys.platform == "linux" else 0.1)
-    assert one.source.poll() == []
-
-
 def test_a_datagram_that_ends_amid_its_second_message_holds_one(listening):
     one = listening()
     assert len(one.hear(pack(odometry(1000)) + pack(odometry(2000))[:-1])) == 1 and one.source.rejected == 1
@@ -398,17 +387,8 @@ def poll_until(source, enough) -> list:
 class TestSerial:
     """Over a pseudo-terminal."""
 
-    @pytest.fixture
-    def wire(self):
-        """The far end of a wire, and the path of the near one."""
-        pytest.importorskip("serial")
-        far, near = os.openpty()
-        tty.setraw(near)
-        yield far, os.ttyname(near)
-        for descriptor in (far, near):
-            os.close(descriptor)
-
     def test_messages_come_in_pieces_amid_noise(self, wire):
+        pytest.importorskip("serial")
         far, path = wire
         source = make_poses(PoseConfig("mavlink", device=path, baud=921_600))
         assert source.poll() == []
@@ -421,11 +401,6 @@ class TestSerial:
         assert time.monotonic() - 1.0 < received[0].time <= time.monotonic()
         source.close()
         source.close()
-
-    def test_a_missing_device_is_said(self):
-        pytest.importorskip("serial")
-        with pytest.raises(OSError, match="device=/dev/nowhere: there is no such device"):
-            make_poses(PoseConfig("mavlink", device="/dev/nowhere"))
 
     def test_a_device_that_goes_is_said(self):
         pytest.importorskip("serial")
