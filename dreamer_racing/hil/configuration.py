@@ -258,8 +258,14 @@ def given_limits(config: HilConfig) -> dict[str, Any]:
 
 
 def limits_of(config: HilConfig, track: Track) -> SafetyLimits:
-    """Return the safety limits of a flight."""
-    return SafetyLimits.of_track(track, **tolerances_of(config) | given_limits(config))
+    """Return the safety limits of a flight: the user's, else those of pose source and flyer, else the default.
+
+    Body rates estimated from attitudes only lag behind them, and a hovering vehicle is not stranded.
+    """
+    estimated = config.pose_message in WITHOUT_BODY_RATES or (config.pose == "ros2" and config.pose_message is None)
+    tolerances = {"rate_tolerance": UNLIMITED_RATE} if estimated else {}
+    hovers = {"still_time": 3600.0} if config.actor == IDENTIFY else {}
+    return SafetyLimits.of_track(track, **tolerances | hovers | given_limits(config))
 
 
 def pilot_contract(config: HilConfig) -> dict[str, Any]:
@@ -283,16 +289,6 @@ def make_chain(config: HilConfig, flyer: Flyer, track: Track) -> FlightChain:
     )
     camera = None if flyer.camera is None else NoseCamera(track, flyer.camera, config.renderer)
     return FlightChain(flyer, track, settings, camera)
-
-
-def tolerances_of(config: HilConfig) -> dict[str, float]:
-    """Return the safety limits that depend on pose source and flyer; the user's settings override them.
-
-    Body rates estimated from attitudes only lag behind them, and a hovering vehicle is not stranded.
-    """
-    estimated = config.pose_message in WITHOUT_BODY_RATES or (config.pose == "ros2" and config.pose_message is None)
-    hovers = {"still_time": 3600.0} if config.actor == IDENTIFY else {}
-    return {**({"rate_tolerance": UNLIMITED_RATE} if estimated else {}), **hovers}
 
 
 def stamping_of(config: HilConfig) -> Stamping:

@@ -158,7 +158,7 @@ class Model:
             arrived = self._fresh[at, columns].flatten() & (step >= late).repeat_interleave(stretches_)
             loop.state[:, Row.THROTTLE, 2].masked_fill_(arrived, 0.0)
             if step == self._handover:
-                self._store_states(candidate=0)
+                self._store_states()
             self._flight.step(0)
             if step % EVERY == EVERY - 1:
                 rates.append(self._qvel[:, 3:].view(*self._shape, 3).clone())
@@ -182,16 +182,17 @@ class Model:
                 rows = self._follows.repeat(candidates).view(-1, *[1] * (kept.ndim - 1))
                 kept.copy_(torch.where(rows, of_all, kept))
 
-    def _store_states(self, candidate: int) -> None:
-        """Store controller state and rotor speeds of a candidate's drones, each for the stretch after its own."""
+    def _store_states(self) -> None:
+        """Store controller states and rotor speeds of the first candidate, each for the stretch after its own."""
         loop = self._quadrotor.rate_loop
         assert loop is not None
-        own = slice(candidate * self._shape[1], (candidate + 1) * self._shape[1])
+        own = slice(self._shape[1])
         self._next = loop.state[own].roll(1, 0).clone(), self._quadrotor.rotor_speed[own].roll(1, 0).clone()
 
     def _set_parameters(self, candidates: Tensor) -> Tensor:
         """Set the parameters of the drones of candidates (C, P); return the delay of each, (C,) ms."""
-        loop, values = self._quadrotor.rate_loop, by_name(candidates)
+        loop = self._quadrotor.rate_loop
+        values = {parameter.name: candidates[:, index] for index, parameter in enumerate(PARAMETERS)}
         assert loop is not None
         own = torch.ones(len(candidates), len(DroneParameter), 3, dtype=torch.float64)
         for row, gain, axes in ((DroneParameter.P, "p", 3), (DroneParameter.I, "i", 3), (DroneParameter.D, "d", 2)):
@@ -202,11 +203,6 @@ class Model:
         own[:, DroneParameter.MOTORS] = motors
         loop.drone_parameters.copy_(own.repeat_interleave(self._shape[1], 0))
         return ((self._delay + values["delay"]) / DT).round().long().clamp(min=0)
-
-
-def by_name(candidates: Tensor) -> dict[str, Tensor]:
-    """Return the parameters of candidates (C, P) by name, (C,) each."""
-    return {parameter.name: candidates[:, index] for index, parameter in enumerate(PARAMETERS)}
 
 
 def fit(recorded: Recorded, nominal: QuadrotorParameters) -> Fit:
@@ -338,15 +334,11 @@ def apply(nominal: QuadrotorParameters, values: dict[str, float], thrust: float 
     firmware: Any = nominal.betaflight
     gains = {
         gain: tuple(
-            round(number * values.get(f"{gain}_{axis}", 1.0) / thrust, 2)
+            round(number * values.get(f"{gain[0]}_{axis}", 1.0) / thrust, 2)  # the factor of D is that of D max, too
             for axis, number in zip(AXES, getattr(firmware, gain), strict=False)
         )
-        for gain in ("p", "i", "d")
+        for gain in ("p", "i", "d", "d_max")
     }
-    gains["d_max"] = tuple(
-        round(number * values.get(f"d_{axis}", 1.0) / thrust, 2)
-        for axis, number in zip(AXES, firmware.d_max, strict=False)
-    )
     return replace(
         nominal,
         betaflight=replace(firmware, **gains),

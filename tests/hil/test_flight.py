@@ -166,13 +166,6 @@ def test_the_battery_is_heard_in_flight_reckoned_with_and_played_back(tmp_path):
     assert first_difference(chain(), ticks).startswith("tick 7: voltage was "), "bit for bit"
 
 
-def test_nothing_is_armed_without_leave():
-    plant = Watched(CIRCLE)
-    ended = plant.fly(chain_of(Hover(), plant, arm=False), Hover.rate, 2.0)
-    assert ended.startswith("2 s are over; not armed:") and "arm=true" in ended
-    assert not any(command.armed for _, command in plant.sent)
-
-
 @pytest.mark.parametrize("phase", [0.005, 0.035])
 def test_poses_are_lost_to_cut_within_200_ms_at_25_hz_by_an_actor_that_takes_30_ms(phase):
     """Whenever in a tick the last one was measured; what is cut does not wait for the actor."""
@@ -339,7 +332,9 @@ def test_what_speaks_against_arming_is_said_when_it_changes_and_not_with_every_e
     plant = Watched(CIRCLE)
     plant.happens = lambda elapsed: setattr(plant, "enable_after", 0.0 if int(elapsed / 0.3) % 2 else 9.0)
     with caplog.at_level(logging.INFO, "dreamer_racing.hil.loop"):
-        plant.fly(chain_of(Hover(), plant, arm=False), Hover.rate, 3.0)
+        ended = plant.fly(chain_of(Hover(), plant, arm=False), Hover.rate, 3.0)
+    assert ended.startswith("3 s are over; not armed:") and "arm=true" in ended
+    assert not any(command.armed for _, command in plant.sent)
     said = [record.getMessage() for record in caplog.records if record.getMessage().startswith("not armed")]
     assert 1 <= len(said) <= 3 and "arm=true" in said[-1]
 
@@ -452,6 +447,7 @@ def test_until_it_moves_a_vehicle_is_lifted_and_its_flyer_begun_anew(lift):
         fresh = True
 
         def reset(self):
+            super().reset()
             self.fresh = True
 
         def act(self, pose, image, target_gate):
@@ -467,6 +463,7 @@ def test_until_it_moves_a_vehicle_is_lifted_and_its_flyer_begun_anew(lift):
     plant.fly(chain, flyer.rate, 1.5)
     wanted = {outputs.setpoint.collective_thrust for outputs in shown if outputs.setpoint is not None}
     assert wanted == {14.0}, "what the flyer wants is shown also when the lift is sent"
+    assert flyer.resets > 25 and flyer.prepared == len(shown), "reset at each tick on the stand; prepared after each"
     armed = [(moment, command.setpoint) for moment, command in plant.sent if command.armed]
     turning = next(index for index, (_, setpoint) in enumerate(armed) if setpoint.body_rates.any())
     if not lift:
@@ -607,20 +604,6 @@ def test_a_lift_that_lifts_nothing_or_is_clipped_is_refused(lift, limits):
 def test_a_latency_that_is_no_time_is_refused(latency):
     with pytest.raises(ValueError, match=f"latency={latency!r}: must be (a number, )?at least 0 and at most 1"):
         FlightChain(Hover(), CIRCLE, ChainConfig(SafetyLimits.of_track(CIRCLE), latency=latency), None)
-
-
-def test_the_actor_forgets_until_the_vehicle_moves():
-    class Climb(Hover):
-        def act(self, pose, image, target_gate):
-            return hover()._replace(collective_thrust=14.0)
-
-    flyer, plant = Climb(), Watched(CIRCLE)
-    chain = chain_of(flyer, plant)
-    ended = plant.fly(chain, flyer.rate, 30.0)
-    assert chain.safety.state is State.CUT and "fence" in ended
-    began = next(moment for moment, command in plant.sent if command.setpoint.collective_thrust > 13.0)
-    assert began * 50 - 5 < flyer.resets < (began + 0.4) * 50
-    assert flyer.prepared > began * 50, "after each tick"
 
 
 @pytest.mark.parametrize("name", ["figure8", "kidney"])

@@ -23,7 +23,7 @@ from dreamer_racing.hil.flyer import check_contract, check_flown_by_betaflight, 
 from dreamer_racing.hil.recording import FILE, Flight, FlightRecorder
 from dreamer_racing.hil.safety_limits import SafetyLimits
 from dreamer_racing.hil.sticks import RateMap, ThrustMap, channels
-from dreamer_racing.hil.vehicle import GRAVITY, Command, Setpoint, at_rest, hover
+from dreamer_racing.hil.vehicle import GRAVITY, Command, Setpoint, hover
 from dreamer_racing.plant.lock_step import LockStep, make_chain
 from dreamer_racing.plant.vehicle import PlantVehicle
 
@@ -155,19 +155,6 @@ def armed(thrust: float = GRAVITY, rates: tuple[float, float, float] = (0.0, 0.0
     return Command(True, Setpoint(thrust, np.array(rates)))
 
 
-@pytest.mark.parametrize(
-    ("rates", "sticks"),
-    [
-        ((5.0, 0.0, 0.0), (0.5, 0.0, 0.0)),  # rolls right: stick right
-        ((0.0, 2.0, 0.0), (0.0, 0.25, 0.0)),  # nose down: stick forward
-        ((0.0, 0.0, 1.0), (0.0, 0.0, -0.25)),  # yaws left: stick left
-        ((-50.0, 50.0, 50.0), (-1.0, 1.0, -1.0)),
-    ],
-)
-def test_signs_and_ends_of_sticks(rates, sticks):
-    assert RATES.to_sticks(np.array(rates)) == sticks
-
-
 def test_hover_of_the_projects_drone():
     """motor² · 16 N = 0.6 kg · 9.81 m/s², and the throttle by Betaflight's formula."""
     motor = math.sqrt(0.6 * 9.81 / 16.0)
@@ -219,21 +206,9 @@ def test_channels_stay_within_their_ends(thrust, rates, is_armed, arm_channel):
 
 
 def test_order_of_channels():
-    """Roll, pitch, throttle, yaw; by Betaflight's default map AETR1234."""
+    """Roll, pitch, throttle, yaw; by Betaflight's default map AETR1234; see `links/test_sitl.py`."""
     values = channels(armed(16.0 / 0.6, (10.0, -8.0, 2.0)), RATES, THRUST)
     assert values == (2000, 1000, 2000, 1250, 2000, *[1000] * 11)
-
-
-@pytest.mark.parametrize(
-    "command", [at_rest(), armed(20.0, (1.0, 2.0, 3.0))._replace(armed=False), armed(math.nan)._replace(armed=False)]
-)
-def test_disarmed_is_throttle_down_and_sticks_centred(command):
-    assert channels(command, RATES, THRUST) == (1500, 1500, 1000, 1500, *[1000] * 12)
-
-
-def test_armed_without_thrust_is_low_enough_to_arm():
-    """Betaflight refuses to arm unless the throttle is below min_check."""
-    assert channels(armed(0.0), RATES, THRUST)[2] == 1000
 
 
 @pytest.mark.parametrize(("field", "value"), [("roll", 0.0), ("pitch", math.nan), ("yaw", 573.0)])

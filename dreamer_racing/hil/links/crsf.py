@@ -22,7 +22,7 @@ from dreamer_racing.hil.links.telemetry import FrameReader, Telemetry
 HEADER = b"\xc8\x18\x16"
 ADDRESSES = (0xC8, 0xEA, 0xEC, 0xEE)
 """First bytes of frames: of flight controller, handset, receiver and transmitter module."""
-BATTERY_SENSOR, _BATTERY_PAYLOAD = 0x08, 8
+BATTERY_SENSOR, _BATTERY_FRAME = 0x08, 12  # kind, and bytes of a frame
 _SHORTEST, _LONGEST = 2, 62  # allowed values of the length byte
 _POLYNOMIAL = 0xD5  # DVB-S2
 
@@ -42,16 +42,14 @@ class CrsfTelemetry(Telemetry):
 
     def read(self, data: bytes) -> list[float]:
         """Parse bytes; return the voltages in them, V, in steps of 0.1 V."""
-        damaged, voltages = self._frames.rejected, []
+        voltages = []
         for frame in self._frames.read(data):
-            payload = frame[3:-1]
-            if frame[2] != BATTERY_SENSOR:
+            if frame is not None and frame[2] != BATTERY_SENSOR:
                 continue
-            if len(payload) < _BATTERY_PAYLOAD:
+            if frame is None or len(frame) < _BATTERY_FRAME:
                 self.rejected += 1
             else:
-                voltages.append(int.from_bytes(payload[:2], "big") / 10)
-        self.rejected += self._frames.rejected - damaged
+                voltages.append(int.from_bytes(frame[3:5], "big") / 10)
         return voltages
 
 

@@ -94,8 +94,11 @@ class MspTelemetry(Telemetry):
 
     def read(self, data: bytes) -> list[float]:
         """Parse bytes; return the voltages in them, V, in steps of 0.01 V."""
-        damaged, voltages = self._frames.rejected, []
+        voltages = []
         for frame in self._frames.read(data):
+            if frame is None:
+                self.rejected += 1
+                continue
             kind, payload, answered = frame[4], frame[5:-1], frame[2] == ord(">")
             if kind == BATTERY_STATE:
                 voltage = _voltage(payload) if answered else None
@@ -109,7 +112,6 @@ class MspTelemetry(Telemetry):
                 self.status = read_status(payload) or self.status
             elif kind == BOXIDS and answered:
                 self.boxes = payload
-        self.rejected += self._frames.rejected - damaged
         return voltages
 
     def refusal(self, armed: bool) -> str:

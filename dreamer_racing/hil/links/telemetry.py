@@ -40,19 +40,15 @@ class FrameReader:
         size_of: Returns the size of the frame at the start of the given bytes, up to 8; 0 if more bytes are needed to
             tell; None if no frame starts there.
         is_whole: Returns whether the checksum of a frame is right.
-
-    Attributes:
-        rejected: Number of frames that were damaged, and of byte runs that were no frame.
     """
 
     def __init__(self, size_of: Callable[[bytes], int | None], is_whole: Callable[[bytes], bool]) -> None:
         self.size_of, self.is_whole = size_of, is_whole
-        self.rejected = 0
         self._buffer = bytearray()
         self._lost = False  # whether the last byte was skipped: consecutive ones count once
 
-    def read(self, data: bytes) -> Iterator[bytes]:
-        """Add bytes; yield the intact frames in them, oldest first."""
+    def read(self, data: bytes) -> Iterator[bytes | None]:
+        """Add bytes; yield the intact frames in them, oldest first, and None for damaged ones and runs of no frame."""
         self._buffer += data
         while self._buffer:
             size = self.size_of(bytes(self._buffer[:8]))
@@ -60,9 +56,10 @@ class FrameReader:
                 return  # the rest is on its way
             frame = bytes(self._buffer[: size or 0])
             if size is None or not self.is_whole(frame):
-                self.rejected += size is not None or not self._lost
-                self._lost = True
+                counts, self._lost = size is not None or not self._lost, True
                 del self._buffer[0]
+                if counts:
+                    yield None
                 continue
             del self._buffer[:size]
             self._lost = False
