@@ -25,11 +25,7 @@ class Reading(NamedTuple):
 
 @dataclass(frozen=True, kw_only=True)
 class BatteryConfig:
-    """A battery's expected voltage, and how readings of it are checked and smoothed.
-
-    Raises:
-        ValueError: A number is out of its range.
-    """
+    """A battery's expected voltage, and how readings of it are checked and smoothed."""
 
     voltage: float = field(metadata={ALLOWED: POSITIVE})  # V, assumed until the first reading
     # share of `voltage` by which a reading may differ from it; one that differs more is rejected, as it may be of a
@@ -99,11 +95,7 @@ class Battery:
 
 
 def battery_words(battery: dict[str, Any]) -> str:
-    """Return, in words, the voltage that the thrust map used at the end of a flight, and where it came from.
-
-    Args:
-        battery: ``voltage_set`` and ``voltage``, V, and `Battery.summary`.
-    """
+    """Return, in words, the voltage that the thrust map used at the end of a flight, and where it came from."""
     if not battery["readings"]:
         return f"battery: no usable reading; thrust was computed with voltage={battery['voltage_set']:g}"
     age = battery["last_reading_age_s"]

@@ -19,13 +19,8 @@ from dreamer_racing.settings import check_choice
 class NoseCamera:
     """Renders images of a track, in the thread that created it only.
 
-    Args:
-        track: Track to render.
-        camera: The camera that the actor was trained with.
-        backend: ``egl``, ``osmesa``, or ``auto`` for the first that works.
-
     Attributes:
-        backend: The one in use.
+        backend: The one in use, ``egl`` or ``osmesa``; with ``auto`` the first that works.
 
     Raises:
         ValueError: There is no such back end.

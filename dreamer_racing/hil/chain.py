@@ -103,12 +103,6 @@ class FlightChain:
     first lifted straight up with growing thrust; the flyer runs at each tick, and is reset until the vehicle rises. If
     no rise is seen within `SafetyLimits.lift_time`, motors are cut.
 
-    Args:
-        flyer: Chooses the setpoints.
-        track: To fly.
-        config: All other settings.
-        camera: None if the flyer needs none.
-
     Raises:
         ValueError: The latency is out of range, the camera's frame rate does not fit the flyer's rate, or the lift is
             not within its range and safety's limits.

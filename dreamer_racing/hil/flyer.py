@@ -45,10 +45,6 @@ class ActorFlyer:
     Args:
         path: The ``.onnx`` file, or the folder of an included agent.
 
-    Attributes:
-        contract: The actor's contract.
-        needs_imu: Whether it needs IMU samples.
-
     Raises:
         FileNotFoundError: There is no such file.
         ValueError: Its contract is invalid, or it was not trained on images.
@@ -126,12 +122,7 @@ def check_contract(contract: dict[str, Any], track: Track, rate: float | None = 
 
 
 def check_rate_loop(contract: dict[str, Any], vehicle: str, force: bool) -> str | None:
-    """Refuse an actor that was trained with another rate loop than the vehicle has, unless ``force``.
-
-    Args:
-        contract: The actor's contract.
-        vehicle: A preset, or the file of an identified drone.
-        force: Whether to fly it anyway.
+    """Refuse an actor of another rate loop than that of a vehicle, a preset or a file, unless ``force``.
 
     Returns:
         What differs, if forced, or was not compared, in words; None if the rate loops match.

@@ -17,7 +17,7 @@ import time
 from collections.abc import Callable
 from typing import IO, Any, NamedTuple, Protocol
 
-from dreamer_racing.hil.inlet import bind
+from dreamer_racing.hil.inlet import UdpInlet
 from dreamer_racing.hil.packets import PacketFormat
 
 PACKET = PacketFormat(b"DRO1", "IBB")
@@ -70,22 +70,15 @@ def decode_operator(data: bytes) -> tuple[int, Operator] | None:
 class UdpOperator:
     """A switch on the network. A kill is latched; an enable lapses when packets stop.
 
-    Args:
-        port: To listen on.
-        host: Address to listen on.
-        clock: Returns the time, s; tests replace it.
-
     Attributes:
         rejected: Number of datagrams that were invalid, or older than one before. A switch that restarts its numbers
             needs a new flight.
     """
 
-    _MOST = 256  # datagrams read per call, so that a flood cannot stall the loop
-
     def __init__(self, port: int, host: str = "127.0.0.1", clock: Callable[[], float] = time.monotonic) -> None:
         self.rejected = 0
-        self._socket = bind(host, port)
-        self.address: tuple[str, int] = self._socket.getsockname()
+        self._inlet = UdpInlet(port, host)
+        self.address = self._inlet.address
         self._clock = clock
         self._wish = Operator(False, False)
         self._heard = -DEAD_MAN
@@ -93,11 +86,7 @@ class UdpOperator:
 
     def poll(self, armed: bool = False) -> Operator:
         """Return the operator's wish, without blocking."""
-        for _ in range(self._MOST):
-            try:
-                data = self._socket.recv(PACKET.size + 1)
-            except (BlockingIOError, ConnectionRefusedError):
-                break
+        for _, data in self._inlet.read():
             self._take(decode_operator(data))
         alive = self._clock() - self._heard < DEAD_MAN
         return Operator(self._wish.enable and alive, self._wish.kill)
@@ -117,7 +106,7 @@ class UdpOperator:
 
     def close(self) -> None:
         """Close the socket."""
-        self._socket.close()
+        self._inlet.close()
 
 
 class KeyboardOperator:
@@ -166,10 +155,7 @@ def is_remote_terminal() -> bool:
 def send_operator(source: OperatorSource, send: Callable[[bytes], object], sleep: Callable[[float], None]) -> None:
     """Send an operator's wish until it is a kill, then the kill for a while; Ctrl-C is a kill, too.
 
-    Args:
-        source: Source of the wish.
-        send: Sends a packet. Packets are numbered by the clock, so that a restarted switch continues the sequence.
-        sleep: Waits for a number of s.
+    Packets are numbered by the clock, so that a restarted switch continues the sequence.
     """
     number, left, wish, said = int(SEND_RATE * time.time()), KILLS, Operator(False, False), ""
     while left:
@@ -212,9 +198,7 @@ def main() -> None:
 class TimedOperator:
     """Toggles the enable automatically until the vehicle is armed: for simulated vehicles, never for real ones.
 
-    Args:
-        delay: s for which the enable is released, and then given, alternately.
-        clock: Returns the time, s; tests replace it.
+    It is released, and then given, for ``delay`` s each.
     """
 
     def __init__(self, delay: float = 0.5, clock: Callable[[], float] = time.monotonic) -> None:

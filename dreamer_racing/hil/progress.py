@@ -23,9 +23,7 @@ class GatePass(NamedTuple):
 class GateProgress:
     """Counts gates passed in order. A pass crosses the gate's plane forwards, inside its opening less a margin.
 
-    Args:
-        track: The gates.
-        limits: Safety limits; a pose that has jumped further than they allow passes no gate.
+    A pose that has jumped further than the safety limits allow passes no gate.
 
     Attributes:
         target: Index of the gate that comes next.
@@ -49,10 +47,8 @@ class GateProgress:
     def update(self, pose: Pose, judged: bool = True) -> GatePass | None:
         """Add the next measured pose; return the gate passed since the one before, if any.
 
-        Args:
-            pose: The pose.
-            judged: Whether safety checks this pose, as it does the newest of each tick. An unchecked pose that has
-                jumped is ignored, and progress continues from the one before.
+        Safety judges the newest pose of each tick. One that is not judged and has jumped is ignored, and progress
+        continues from the one before.
         """
         last = self._last
         if last is None:

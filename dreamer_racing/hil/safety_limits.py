@@ -65,7 +65,7 @@ class SafetyLimits:
     # rad/s by which reported body rates may differ from those of the attitudes, as long as no two poses are more than
     # `hold_after` apart
     rate_tolerance: float = setting(5.0, _MOST)
-    velocity_window: float = setting(0.075, _SECONDS)  # s over which both are compared, see `hil.odometer`
+    velocity_window: float = setting(0.075, _SECONDS)  # s over which both are compared, see `motion.Odometer`
     tilt_max_degrees: float = setting(100.0, _DEGREES)  # tilt from level that may be exceeded for `tilt_time` only
     tilt_time: float = setting(0.2, _TOLERANCE)  # s
     # s below `start_speed` after which a vehicle that has flown counts as crashed: racers never hover

@@ -144,9 +144,9 @@ def channels(command: Command, rates: RateMap, thrust: ThrustMap, arm_channel: i
     throttle is down and the other sticks are centred, whatever the setpoint.
 
     Args:
-        command: The command; if it is armed, its setpoint must be finite.
-        rates: Map of roll, pitch and yaw.
-        thrust: Map of the throttle.
+        command: If it is armed, its setpoint must be finite.
+        rates: Of roll, pitch and yaw.
+        thrust: Of the throttle.
         arm_channel: Index of the arm switch: 2000 µs if armed, else 1000 µs; all other switches are always at 1000 µs.
 
     Returns:

@@ -23,7 +23,7 @@ class Watchdog:
     frames. A lock lets only one of loop and thread send at a time.
 
     Args:
-        link: Link to the vehicle.
+        link: To the vehicle.
         longest: s allowed from an armed command to the next command.
         now: Returns the time of the loop's clock, s, which also runs while the loop sleeps.
 

@@ -84,7 +84,7 @@ class BetaflightSitl:
     """`Controls` that fly the vehicle by the motor commands of the firmware.
 
     Args:
-        vehicle: The vehicle; its delay and body-rate controller are not used.
+        vehicle: Its delay and body-rate controller are not used.
         send: Sends a state packet to the firmware.
         firmware: Its release, see `convention_of`.
         timeout: s, of `Failsafe`.
@@ -92,7 +92,6 @@ class BetaflightSitl:
     Attributes:
         received: Number of motor packets.
         malformed: Number of messages that were not motor packets.
-        failsafe: Decides whether motors may turn.
     """
 
     def __init__(

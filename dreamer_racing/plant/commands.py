@@ -17,12 +17,9 @@ TIMEOUT = 0.25
 
 
 class Failsafe:
-    """Decides whether motors may turn: not after a silence, and not before a disarmed message.
+    """Decides whether motors may turn: not after a silence of ``timeout`` s, and not before a disarmed message.
 
     As with a radio's arm switch, it is not enough to be armed from the first message on, or again after a silence.
-
-    Args:
-        timeout: s of silence.
 
     Attributes:
         events: Number of silences so far while the vehicle was cleared to arm.
@@ -83,16 +80,11 @@ class Controls(Protocol):
 class CommandReceiver:
     """Flies the vehicle by command packets (`hil.links.udp`).
 
-    Args:
-        vehicle: The vehicle.
-        timeout: s, of `Failsafe`.
-
     Attributes:
         received: Number of valid packets that were newer than any before.
         lost: Number of packets that never came, by the gaps in the sequence.
         stale: Number of valid packets that were not newer; they are ignored, so that none acts twice or late.
         malformed: Number of messages that were not commands.
-        failsafe: Decides whether motors may turn.
     """
 
     def __init__(self, vehicle: PlantVehicle, timeout: float = TIMEOUT) -> None:

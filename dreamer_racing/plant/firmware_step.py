@@ -138,7 +138,7 @@ class FirmwareStep(LockStep):
         vehicle: The drone.
         firmware: One that was started, and has not flown since.
         link: To the firmware.
-        delivery: Of its poses.
+        delivery: Of the drone's poses.
 
     Attributes:
         disarmed_at: When its motors first stopped after they had turned, s of physics; None: never.

@@ -31,10 +31,6 @@ ENABLE_AFTER = 0.5
 class LockStep:
     """A plant with all that a `FlightLoop` needs: clock, link, pose source and operator.
 
-    Args:
-        vehicle: The drone.
-        delivery: Of its poses.
-
     Attributes:
         plant: The drone, with its controls and pose delivery.
         enable_after: s after which the operator gives the enable.

@@ -65,7 +65,7 @@ class Plant:
     Args:
         vehicle: The drone.
         controls: Receives the messages that control it.
-        delivery: Sampling, delay, loss and noise of poses.
+        delivery: Of its poses.
         send: Sends a pose packet.
         incoming: Socket by which the sender of commands gets IMU samples, as often as poses are measured; None: they
             are not sent.
@@ -150,12 +150,7 @@ def fly_in_real_time(
 ) -> None:
     """Fly by the wall clock, counted from now; delays are caught up with, and do not add up.
 
-    Args:
-        plant: The plant.
-        incoming: Of datagrams for it.
-        stop: Ends the flight on request.
-        speed: s of physics per s of the clock.
-        duration: s of physics.
+    The speed is in s of physics per s of the clock, the duration in s of physics.
     """
     start = time.monotonic() - plant.time / speed
     while not stop.requested and plant.time < duration:

@@ -583,16 +583,6 @@ def test_a_lift_that_no_pose_shows_ends_low(hidden, thrust, low, high):
     assert low < max(heights) - heights[0] < high
 
 
-def test_a_flyer_that_wants_nothing_usable_is_not_lifted():
-    class Broken(Hover):
-        def act(self, pose, image, target_gate):
-            return Setpoint(np.nan, np.zeros(3))
-
-    plant = Watched(CIRCLE)
-    assert "no usable setpoint" in plant.fly(chain_of(Broken(), plant), Hover.rate, 3.0)
-    assert plant.vehicle.pose().position[2] == pytest.approx(CIRCLE.start_position[2], abs=0.02)
-
-
 @pytest.mark.parametrize(("lift", "limits"), [(1.05, {}), (-1.0, {}), (1.6, {}), (1.4, {"thrust_max": 13.0})])
 def test_a_lift_that_lifts_nothing_or_is_clipped_is_refused(lift, limits):
     config = ChainConfig(SafetyLimits.of_track(CIRCLE, **limits), lift=lift)

@@ -14,9 +14,9 @@ from dreamer_racing.envs.tracks import load_track
 from dreamer_racing.hil.attitude import rotation_between, rotation_matrix, turn
 from dreamer_racing.hil.chain import ChainConfig
 from dreamer_racing.hil.identify import AMPLITUDES, AXES, IdentificationFlyer, make_schedule
-from dreamer_racing.hil.odometer import Odometer, TurnOdometer
+from dreamer_racing.hil.motion import Odometer, TurnOdometer
+from dreamer_racing.hil.pose_sources.messages import GAP, VelocityEstimator
 from dreamer_racing.hil.safety import SafetyLimits
-from dreamer_racing.hil.velocity import GAP, VelocityEstimator
 from dreamer_racing.plant.lock_step import LockStep, make_chain
 from dreamer_racing.plant.vehicle import PlantVehicle
 

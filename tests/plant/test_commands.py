@@ -11,7 +11,7 @@ from dreamer_racing.envs.drone.parameters import GRAVITY
 from dreamer_racing.hil.links.udp import CommandPacket, encode_command
 from dreamer_racing.hil.pose import PosePacket, decode_pose
 from dreamer_racing.hil.vehicle import Command, Pose, Setpoint
-from dreamer_racing.plant.commands import CommandReceiver, Failsafe
+from dreamer_racing.plant.commands import CommandReceiver
 from dreamer_racing.plant.delivery import Delivery, PoseDelivery
 from dreamer_racing.plant.vehicle import PlantVehicle
 
@@ -79,14 +79,6 @@ def test_a_sender_that_begins_anew_is_heard_after_the_failsafe(vehicle: PlantVeh
     assert not receiver.take(packet(0, armed=False), 0.1)
     receiver.act(0.25)
     assert receiver.take(packet(1, armed=False), 0.3) and receiver.lost == 0
-
-
-def test_failsafe_counts_only_what_it_ended() -> None:
-    failsafe = Failsafe(0.1)
-    assert not failsafe.expire(5.0)
-    assert not failsafe.hear(True, 5.0) and failsafe.deadline == np.inf
-    assert not failsafe.hear(False, 5.0) and failsafe.hear(True, 5.05)
-    assert failsafe.expire(5.2) and not failsafe.expire(5.3) and failsafe.events == 1
 
 
 # Poses on their way out: noise, loss, latency and jitter have the statistics that they are set to.

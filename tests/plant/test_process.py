@@ -25,7 +25,6 @@ from dreamer_racing.plant.process import (
     check_process,
     fly_in_lock_step,
     fly_in_real_time,
-    open_sockets,
 )
 from dreamer_racing.plant.vehicle import PlantVehicle
 from dreamer_racing.settings import check_settings
@@ -242,9 +241,3 @@ def test_what_excludes_each_other_is_refused(options: dict[str, object], message
 def test_impossible_numbers_are_refused(options: dict[str, float]) -> None:
     with pytest.raises(ValueError, match=f"{next(iter(options))}=.*must be at least"):
         check_settings(ProcessOptions(**options))
-
-
-def test_a_port_in_use_is_refused_by_name(incoming: socket.socket) -> None:
-    port = incoming.getsockname()[1]
-    with pytest.raises(OSError, match=f"cannot listen on 127.0.0.1:{port}"):
-        open_sockets(ProcessOptions(command_port=port))

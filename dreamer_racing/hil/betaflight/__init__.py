@@ -11,10 +11,7 @@ and `firmware` runs a Betaflight that was built for a computer (SITL).
 """
 
 from dreamer_racing.hil.betaflight.settings import (
-    AXES,
     LINKS,
-    Finding,
-    Setting,
     Status,
     check_dump,
     print_settings,
@@ -24,10 +21,7 @@ from dreamer_racing.hil.betaflight.settings import (
 )
 
 __all__ = [
-    "AXES",
     "LINKS",
-    "Finding",
-    "Setting",
     "Status",
     "check_dump",
     "print_settings",

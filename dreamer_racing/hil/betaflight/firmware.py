@@ -117,15 +117,12 @@ class Firmware:
 
     def stop(self) -> None:
         """Stop it, and wait until its process has ended."""
-        process, self._process = self._process, None
-        if process is None:
-            return
-        process.terminate()
-        try:
-            process.wait(_STOPS_WITHIN)
-        except subprocess.TimeoutExpired:
-            process.kill()
-            process.wait()
+        if self._process is not None:
+            self._process.terminate()
+            if not self._has_ended(_STOPS_WITHIN):
+                self._process.kill()
+                self._process.wait()
+            self._process = None
 
     def close(self) -> None:
         """Stop it, and remove its folder; may be called twice."""
@@ -180,10 +177,7 @@ class Firmware:
             self.refused = line.type_all(lines)
             self.dump = line.execute("dump all")
             line.leave("save")
-            if self._process is not None:
-                self._process.wait(_STOPS_WITHIN)
-        except subprocess.TimeoutExpired:
-            pass  # some releases save their settings and keep running
+            self._has_ended(_STOPS_WITHIN)  # some releases save their settings and keep running
         finally:
             line.close()
             self.stop()
@@ -193,13 +187,17 @@ class Firmware:
         path = Path(self._folder.name) / "settings.txt"
         path.write_text("\n".join([*lines, "save", ""]), encoding="ascii")
         self._run(None, "--config", path.name)
+        saved = self._has_ended(10.0)
+        self.stop()
+        if not saved:
+            raise OSError(f"{self._program} did not exit after --config: its settings were not saved.")
+
+    def _has_ended(self, patience: float) -> bool:
+        """Wait at most ``patience`` s for the process to end by itself; return whether it has."""
         try:
-            if self._process is not None:
-                self._process.wait(10.0)
-        except subprocess.TimeoutExpired as error:
-            raise OSError(f"{self._program} did not exit after --config: its settings were not saved.") from error
-        finally:
-            self.stop()
+            return self._process is None or self._process.wait(patience) is not None
+        except subprocess.TimeoutExpired:
+            return False
 
     def _run(self, step: float | None, *arguments: str) -> None:
         folder = Path(self._folder.name)

@@ -42,11 +42,7 @@ from dreamer_racing.settings import check_choice, given
 
 @dataclass(frozen=True)
 class LinkConfig:
-    """The choice of a link, and its settings.
-
-    Raises:
-        ValueError: ``arm_channel`` is no switch.
-    """
+    """The choice of a link, and its settings."""
 
     name: str  # one of `LINKS`
     host: str = "127.0.0.1"  # host to send to over UDP or TCP

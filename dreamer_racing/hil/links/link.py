@@ -48,7 +48,6 @@ class TransportLink(ABC):
 
     Attributes:
         dropped: Number of commands so far that were not sent, because a buffer was full or nobody listened.
-        thrust: As given, at the present voltage.
     """
 
     def __init__(

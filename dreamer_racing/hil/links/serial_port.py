@@ -46,9 +46,7 @@ _REMEDIES = {
 class SerialPort:
     """A `Transport` and an `Inlet` over a serial port; arrival times are those of reading, up to a tick late.
 
-    Args:
-        device: Its path; those in /dev/serial/by-id/ stay the same when plugged in again.
-        settings: Of the protocol.
+    Paths in /dev/serial/by-id/ stay the same when a device is plugged in again.
 
     Raises:
         ImportError: pyserial is not installed.

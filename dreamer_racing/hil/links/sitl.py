@@ -36,10 +36,7 @@ def encode_sitl(channels: Sequence[float]) -> bytes:
 class SitlTransport:
     """A `Transport` of channels to a firmware on this machine, which holds them back until that has booted.
 
-    Args:
-        channels: Transport to its port for channels.
-        serial: Its first serial port.
-        imu: Whether to request an IMU sample with each command.
+    With each command it requests an IMU sample, if wanted.
     """
 
     ANSWERS_WITHIN = 10.0

@@ -11,10 +11,6 @@ class SerialOverTcp:
     """A `Transport` that never blocks, and connects again whenever the firmware closes the connection.
 
     The firmware takes one connection at a time, and closes another at once.
-
-    Args:
-        port: TCP port.
-        host: Address of this machine.
     """
 
     _RETRY_AFTER = 0.5  # s between attempts to connect

@@ -25,11 +25,7 @@ class Telemetry(ABC):
         """Parse bytes; return the voltages in them, V, oldest first. It never raises."""
 
     def refusal(self, armed: bool) -> str:
-        """Return why the flight controller does not, or would not, follow commands; empty if no reason is known.
-
-        Args:
-            armed: Whether the last command was armed.
-        """
+        """Return why the flight controller does not (if not ``armed``: would not) follow commands, if it is known."""
         return ""
 
 

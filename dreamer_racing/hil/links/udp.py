@@ -133,12 +133,7 @@ class PacketTelemetry(Telemetry):
 
 
 class UdpLink(TransportLink):
-    """Sends command packets to a vehicle that takes setpoints in SI units.
-
-    Args:
-        host: Name or address.
-        port: Where it listens.
-        imu: Whether to receive IMU samples.
+    """Sends command packets to a vehicle that takes setpoints in SI units, and receives IMU samples, if wanted.
 
     Example:
         >>> link = UdpLink("127.0.0.1", 9100)

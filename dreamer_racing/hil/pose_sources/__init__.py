@@ -27,11 +27,7 @@ from dreamer_racing.settings import Range, check_choice, check_settings, given, 
 
 @dataclass(frozen=True)
 class PoseConfig:
-    """The choice of a pose source, and its settings.
-
-    Raises:
-        ValueError: A number is out of its range.
-    """
+    """The choice of a pose source, and its settings."""
 
     name: str  # one of `POSE_SOURCES`
     host: str = "127.0.0.1"  # address to listen on over UDP; the default accepts poses from this machine only

@@ -43,12 +43,9 @@ _LEVEL = np.array((1.0, 0.0, 0.0, 0.0))
 
 
 class MavlinkPose(MessagePose):
-    """Reads poses from MAVLink messages, of version 1 or 2.
+    """Reads poses from MAVLink messages, of version 1 or 2, by an inlet that is closed with it.
 
-    Args:
-        inlet: Receives the bytes; closed with the source.
-        message: Message type of the pose, one of `MESSAGES`; others are ignored and not counted.
-        smoothing: See `MessagePose`.
+    Messages of other types than the chosen one of `MESSAGES` are ignored and not counted.
 
     Raises:
         ImportError: pymavlink is not installed.

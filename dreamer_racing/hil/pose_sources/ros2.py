@@ -28,11 +28,6 @@ NODE = "dreamer_racing_poses"
 class Ros2Pose(MessagePose):
     """Subscribes to a topic with its own node.
 
-    Args:
-        topic: Its name.
-        message: Message type, one of `MESSAGES`.
-        smoothing: See `MessagePose`.
-
     Raises:
         ImportError: rclpy or the messages' package is missing; the message says how to get it.
     """
@@ -108,11 +103,6 @@ def _attitude(quaternion: Any) -> np.ndarray:
 
 
 def _import(name: str) -> Any:
-    """Return a module of ROS 2.
-
-    Raises:
-        ImportError: It cannot be imported.
-    """
     try:
         return importlib.import_module(name)
     except ImportError as error:

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from functools import reduce
+from operator import xor
 
 from dreamer_racing.hil.links.crsf import encode_crsf
 from dreamer_racing.hil.links.msp import encode_msp
@@ -37,6 +39,12 @@ CHANNEL_LINKS = {
 
 def read_channels(name: str, frame: bytes) -> Sequence[float]:
     return CHANNEL_LINKS[name][1](frame)
+
+
+def msp_answer(code: int, payload: bytes, kind: bytes = b">") -> bytes:
+    """The flight controller's answer to a request; ``b"!"``: it does not know it."""
+    body = bytes([len(payload), code]) + payload
+    return b"$M" + kind + body + bytes([reduce(xor, body)])
 
 
 class Recorder:

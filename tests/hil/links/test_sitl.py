@@ -7,8 +7,6 @@ import socket
 import struct
 import time
 from collections.abc import Iterator
-from functools import reduce
-from operator import xor
 
 import numpy as np
 import pytest
@@ -21,7 +19,7 @@ from dreamer_racing.hil.links.msp import IMU_REQUEST, OVERRIDE_REQUEST, MspTelem
 from dreamer_racing.hil.links.sitl import SitlTransport
 from dreamer_racing.hil.links.tcp import SerialOverTcp
 from dreamer_racing.hil.vehicle import Command, Setpoint, at_rest, hover
-from tests.hil.links.frames import CHANNEL_LINKS, RATES, RESTING, THRUST, Recorder, read_words
+from tests.hil.links.frames import CHANNEL_LINKS, RATES, RESTING, THRUST, Recorder, msp_answer, read_words
 
 BOOTGRACE, RXLOSS, THROTTLE = 1 << 9, 1 << 2, 1 << 7
 ARM, ANGLE, OVERRIDE = 1, 1 << 1, 1 << 3
@@ -29,15 +27,10 @@ BOXES = bytes([0, 1, 6, 50])
 """Modes in the order of the status' bits: ARM, ANGLE, HEADFREE, MSP OVERRIDE."""
 
 
-def frame(code: int, payload: bytes) -> bytes:
-    body = bytes([len(payload), code]) + payload
-    return b"$M>" + body + bytes([reduce(xor, body)])
-
-
 def status(modes: int = 0, flags: int = 0) -> bytes:
     """An MSP_STATUS as a 4.6 lays it out, with 29 flags."""
     head = bytes(6) + modes.to_bytes(4, "little") + bytes(5)
-    return frame(101, head + b"\0" + b"\x1d" + flags.to_bytes(4, "little") + bytes(3))
+    return msp_answer(101, head + b"\0" + b"\x1d" + flags.to_bytes(4, "little") + bytes(3))
 
 
 @pytest.fixture
@@ -137,7 +130,7 @@ def test_what_keeps_it_from_arming_is_said_in_its_words() -> None:
     assert telemetry.refusal(False) == "" and "gives no reason" in telemetry.refusal(True)
     telemetry.read(status(modes=ARM, flags=THROTTLE))
     assert telemetry.refusal(True) == ""
-    telemetry.read(frame(101, b"short") + b"$M!" + status(modes=0)[3:])
+    telemetry.read(msp_answer(101, b"short") + b"$M!" + status(modes=0)[3:])
     assert telemetry.refusal(True) == "", "what says nothing changes nothing"
 
 
@@ -156,9 +149,9 @@ def test_beside_a_receiver_the_pilot_arms_and_hands_over(modes: int, flags: int,
     assert telemetry.refusal(False) == "no status was received from it"
     telemetry.read(status(modes, flags))
     assert telemetry.refusal(False) == "no status was received from it"
-    telemetry.read(frame(119, BOXES))
+    telemetry.read(msp_answer(119, BOXES))
     assert telemetry.refusal(False) == telemetry.refusal(True) == words
-    telemetry.read(frame(119, BOXES[:-1]))
+    telemetry.read(msp_answer(119, BOXES[:-1]))
     assert "it has no mode MSP OVERRIDE" in telemetry.refusal(True)
 
 
@@ -171,7 +164,7 @@ def test_beside_a_receiver_nothing_that_is_sent_could_arm(server: socket.socket)
     second = link.send(at_rest())
     assert read_words(second[5:13]) == [1500, 1500, 1000, 1500] and second[14:] == IMU_REQUEST
     assert link.refusal == "no status was received from it"
-    firmware.sendall(frame(119, BOXES) + status(ARM | OVERRIDE))
+    firmware.sendall(msp_answer(119, BOXES) + status(ARM | OVERRIDE))
     deadline = time.monotonic() + 5.0
     while link.refusal and time.monotonic() < deadline:
         link.listen()

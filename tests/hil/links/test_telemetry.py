@@ -5,8 +5,6 @@ from __future__ import annotations
 import math
 import socket
 import struct
-from functools import reduce
-from operator import xor
 
 import numpy as np
 import pytest
@@ -20,7 +18,7 @@ from dreamer_racing.hil.links.mavlink import MavlinkTelemetry
 from dreamer_racing.hil.links.msp import BATTERY_REQUEST, MspTelemetry, encode_msp
 from dreamer_racing.hil.links.udp import PacketTelemetry, UdpLink, UdpTransport
 from dreamer_racing.hil.vehicle import at_rest
-from tests.hil.links.frames import RATES, THRUST
+from tests.hil.links.frames import RATES, THRUST, msp_answer
 
 
 def crsf(payload: str, kind: int = 0x08, address: int = 0xC8) -> bytes:
@@ -28,10 +26,8 @@ def crsf(payload: str, kind: int = 0x08, address: int = 0xC8) -> bytes:
     return bytes([address, len(body) + 1]) + body + bytes([crc8(body)])
 
 
-def msp(payload: str, code: int = 130, answer: bytes = b">") -> bytes:
-    data = bytes.fromhex(payload)
-    body = bytes([len(data), code]) + data
-    return b"$M" + answer + body + bytes([reduce(xor, body)])
+def msp(payload: str, code: int = 130, kind: bytes = b">") -> bytes:
+    return msp_answer(code, bytes.fromhex(payload), kind)
 
 
 CRSF_252 = crsf("00fc 00bd 000897 64")  # the examples of the wiki: 25.2 V, 18.9 A, 2199 mAh, 100 %
@@ -89,7 +85,7 @@ def test_other_frames_are_passed_over(make, frame):
         (CrsfTelemetry, crsf("00fc")),  # too short
         (MspTelemetry, msp("04 dc05 98 6400 d007 00")),  # of a release before 4.0
         (MspTelemetry, msp("00 dc05 98 6400 d007 00 f305")),  # no battery
-        (MspTelemetry, msp("", answer=b"!")),  # the flight controller does not know the question
+        (MspTelemetry, msp("", kind=b"!")),  # the flight controller does not know the question
         (CrsfTelemetry, CRSF_252[:-1] + b"\x00"),
         (MspTelemetry, MSP_1523[:-1] + b"\x00"),
     ],
@@ -224,8 +220,7 @@ def raw_imu(counts: float = 512.0) -> bytes:
     """An MSP_RAW_IMU of that sample, as a Betaflight writes it."""
     force = (round(counts * each / GRAVITY) for each in FORCE)
     rates = (round(16.4 * math.degrees(each)) for each in TURNING)
-    frame = b"$M>" + bytes([18, 102]) + struct.pack("<9h", *force, *rates, 0, 0, 0)
-    return frame + bytes([reduce(xor, frame[3:])])
+    return msp_answer(102, struct.pack("<9h", *force, *rates, 0, 0, 0))
 
 
 @pytest.mark.parametrize("counts", [512.0, 256.0])
@@ -241,9 +236,8 @@ def test_msp_tells_what_the_imu_tells(counts: float) -> None:
 def test_an_answer_of_the_firmware_itself() -> None:
     """A 4.6 that was built for a computer, told body rates (1, 2, 3) rad/s and a force of (-1, -2, 9.81) m/s²."""
     counts = (-26, -52, 256, 939, 1879, 2818, 0, 0, 0)
-    frame = b"$M>" + bytes([18, 102]) + struct.pack("<9h", *counts)
     telemetry = MspTelemetry(256.0)
-    telemetry.read(frame + bytes([reduce(xor, frame[3:])]))
+    telemetry.read(msp_answer(102, struct.pack("<9h", *counts)))
     assert np.allclose(telemetry.imu_samples[0], (1.0, 2.0, 3.0, -1.0, -2.0, GRAVITY), atol=0.01)
 
 
