@@ -1,7 +1,6 @@
 """TensorBoard and Weights & Biases loggers: TorchRL's own, extended to log a run's configuration, images and videos.
 
-Each is a `torchrl.record.loggers.Logger` and a `training.media.MediaLogger`; `make_loggers` creates them from the
-configuration. No data leaves the machine unless ``wandb="online"``.
+`make_loggers` creates them from the configuration. No data leaves the machine unless ``wandb="online"``.
 """
 
 from __future__ import annotations

@@ -124,6 +124,16 @@ class MetricsLog:
         if failed:
             raise failed
 
+    def log_evaluation(self, env_steps: int) -> None:
+        """Send plots and videos of the evaluations at ``env_steps`` to the loggers that take them."""
+        directory, stem = RunDirectory(self.path.parent), f"{env_steps:09d}"
+        for sink in self.loggers:
+            if hasattr(sink, "log_picture") and hasattr(sink, "log_film"):  # TorchRL's own take scalars alone
+                for file in sorted(directory.plots.glob(f"{stem}*.png")):
+                    sink.log_picture(f"evaluation{file.stem.removeprefix(stem)}/plot", file, env_steps)
+                for file in sorted(directory.videos.glob(f"{stem}*.mp4")):
+                    sink.log_film(f"evaluation{file.stem.removeprefix(stem)}/film", file, env_steps)
+
     def close(self) -> None:
         """Close the loggers that can be closed."""
         for sink in self.loggers:

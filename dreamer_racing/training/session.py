@@ -30,8 +30,6 @@ from dreamer_racing.training.checkpoint import BestCheckpoint, RunCheckpointErro
 from dreamer_racing.training.clock import Interval, Journal, Periods, RunClock
 from dreamer_racing.training.directory import RunDirectory, RunLock, latest_checkpoint
 from dreamer_racing.training.episodes import EpisodeTracker
-from dreamer_racing.training.following import LockHeldByFirst, UnwrittenMetrics
-from dreamer_racing.training.media import log_evaluation
 from dreamer_racing.training.metrics import MetricsLog, PendingMetrics
 from dreamer_racing.training.progress import Progress
 from dreamer_racing.training.signals import GracefulExit
@@ -70,7 +68,8 @@ class Session:
     Args:
         config: Config of the recipe: any object with the fields `total_env_steps`, `seed`, `resume`, `logger` (`every`,
             `media`), `evaluation` (`every`, `first`, `stochastic`) and `checkpoint` (`every`, `minutes`, `keep`).
-        lock: Lock of the run directory.
+        directory: Run directory.
+        lock: Its lock, in rank 0.
         note_start: Function of env_steps that records the start and its configuration in the run directory.
         make_loggers: Makes the loggers besides ``metrics.csv``; its argument is the env_steps of the last row that a
             resumed run keeps, or None for a new run.
@@ -80,6 +79,8 @@ class Session:
         clock: Clock of the whole run.
         began: Whether the loop has started; errors before that are mistakes of the user's configuration.
         parts: Parts that are saved, by name; see `track`.
+        evaluator: As given to `track`.
+        metrics: Log of metrics, once `track` was called; None in ranks other than 0.
 
     Example:
         >>> # session.track(learner=learner, env=env, rollouts=rollouts, evaluator=evaluator, tracker=tracker)
@@ -97,26 +98,25 @@ class Session:
     learner: Any
     env: EnvBase
     collected: Rollouts
-    evaluator: Evaluator
+    evaluator: Evaluator | None
     tracker: EpisodeTracker
-    metrics: MetricsLog | UnwrittenMetrics
     checkpoints: RunCheckpoints
     best: BestCheckpoint
 
     def __init__(
         self,
         config: Any,
-        lock: RunLock | LockHeldByFirst,
+        directory: RunDirectory,
+        lock: RunLock | None,
         note_start: Callable[[int], None],
         make_loggers: Callable[[int | None], Sequence[Logger]] = lambda resumed: (),
     ) -> None:
-        self.config = config
-        self.directory = RunDirectory(lock.directory)
+        self.config, self.directory = config, directory
         self.counters = {"env_steps": 0, "updates": 0, "episodes": 0}
         self.clock = RunClock(self.counters, alone=parallel.num_processes() == 1)
         self.began = False
         self.parts: dict[str, Any] = {}
-        self.metrics = UnwrittenMetrics()
+        self.metrics: MetricsLog | None = None
         self.write_line: Callable[[str], None] = logger.info
         self._lock, self._note_start, self._make_loggers = lock, note_start, make_loggers
         every = {"log": config.logger.every, "evaluate": config.evaluation.every, "save": config.checkpoint.every}
@@ -157,7 +157,7 @@ class Session:
         learner: Any,
         env: EnvBase,
         rollouts: Rollouts,
-        evaluator: Evaluator,
+        evaluator: Evaluator | None,
         tracker: EpisodeTracker,
         best: Sequence[str] = (),
         may_lack: Sequence[str] = (),
@@ -169,7 +169,7 @@ class Session:
             learner: A `Learner`.
             env: Training environment; if workers collect, it is closed with the session and not saved.
             rollouts: Source of rollouts.
-            evaluator: Evaluator of the learner's policy.
+            evaluator: Evaluator of the learner's policy; needed in rank 0 only.
             tracker: Finds the finished episodes in rollouts.
             best: Names of parts that the best checkpoint holds besides the learner.
             may_lack: Names of parts that a checkpoint may lack.
@@ -259,13 +259,14 @@ class Session:
         """
         episodes = parallel.all_gather_rows(self.tracker.update(rollout))
         self.counters["episodes"] += len(episodes)
-        self.metrics.push(self.tracker.summary(episodes), len(episodes))
-        self.metrics.push(self.collected.metrics())
+        self.log(self.tracker.summary(episodes), len(episodes))
+        self.log(self.collected.metrics())
         return episodes
 
-    def log(self, metrics: Mapping[str, Tensor | float]) -> None:
-        """Add metrics to the averages of the next row."""
-        self.metrics.push(metrics)
+    def log(self, metrics: Mapping[str, Tensor | float], count: int = 1) -> None:
+        """Add metrics, each the mean of ``count`` values, to the averages of the next row."""
+        if self.metrics is not None:
+            self.metrics.push(metrics, count)
 
     def updates(self, due: int) -> Iterator[int]:
         """Yield the numbers of ``due`` updates, and count them; stop after a signal (a resumed run makes the rest)."""
@@ -292,6 +293,8 @@ class Session:
 
     def evaluate(self) -> None:
         """Evaluate without changing training's random state, and save the best checkpoint if the score is higher."""
+        assert self.evaluator is not None, "only rank 0 has an evaluator"
+        assert self.metrics is not None, "track() makes them"
         self.learner.check_finite()
         self.collected.wait()
         devices = [self.learner.device] if self.learner.device.type == "cuda" else []
@@ -300,7 +303,7 @@ class Session:
             metrics = self.evaluator.make(self.env_steps, self.config.evaluation.stochastic)
             if self.config.logger.media:
                 with self.attempt("pictures for loggers"):
-                    log_evaluation(self.metrics.loggers, self.directory, self.env_steps)
+                    self.metrics.log_evaluation(self.env_steps)
         self.log(metrics)
         # Rank by gates, then by return, which is far below a million.
         score = 1e6 * metrics.get("evaluation/gates_per_episode", 0.0) + metrics["evaluation/return_mean"]
@@ -321,6 +324,7 @@ class Session:
 
     def write_row(self, metrics: Mapping[str, Tensor | float] | None = None) -> None:
         """Write and show a row: the averages of the metrics logged since the latest row, and of these metrics."""
+        assert self.metrics is not None, "only rank 0 writes rows"
         self.log(self.clock.read())
         self.log(metrics or {})
         values = self.metrics.close_row(self.env_steps)
@@ -374,24 +378,27 @@ class Session:
                 self.env.close()  # else the collector closes it
             self.collected.collector.shutdown()
             shutil.rmtree(self.directory.replay, ignore_errors=True)
-            self.evaluator.close()
-            self.metrics.close()
-            self._lock.release()
-        else:
-            self._lock.abandon()
+            if self.evaluator is not None:
+                self.evaluator.close()
+            if self.metrics is not None:
+                self.metrics.close()
+        if self._lock is not None:
+            self._lock.release() if self.parts else self._lock.abandon()
 
     def _begin(self) -> None:
         """Start to handle signals and to show progress."""
         self.began = True
-        self._stop = self._stack.enter_context(graceful_exit())
-        total, shown = self.config.total_env_steps, parallel.is_first()
+        first = parallel.is_first()
+        answer = "saving; a second signal discards all since the last checkpoint" if first else ""
+        agree = parallel.all_reduce_max if parallel.num_processes() > 1 else None
+        self._stop = self._stack.enter_context(GracefulExit(answer, agree))
         begun = self.env_steps, self.counters["updates"]
-        self._progress = self._stack.enter_context(Progress(total, *begun, shown=shown))
-        self._stop.write = self._progress.write_from_handler
-        self.write_line, self.evaluator.on_episode = self._progress.write_line, self._progress.evaluating
-        self.evaluator.attempt = self.attempt
+        self._progress = self._stack.enter_context(Progress(self.config.total_env_steps, *begun, shown=first))
+        self._stop.write, self.write_line = self._progress.write_from_handler, self._progress.write_line
+        if self.evaluator is not None:
+            self.evaluator.on_episode, self.evaluator.attempt = self._progress.evaluating, self.attempt
         self.collected.stopping = lambda: self._stop.signal_name is not None
-        if shown and self.directory.finished_env_steps() > self.env_steps:
+        if first and self.directory.finished_env_steps() > self.env_steps:
             self.directory.finished.unlink()  # the run resumes from before its end
 
     def _end(self) -> None:
@@ -400,16 +407,10 @@ class Session:
         if self.stopping:
             at = f"at {self.env_steps:,} of {self.config.total_env_steps:,} env_steps"
             self.write_line(f"{self._stop.signal_name} {at}: saved; continue with resume={self.directory.path}")
-        elif parallel.is_first():
+        elif self.metrics is not None:
             self.metrics.flush()
             self.directory.mark_finished(self.env_steps)
         self.write_line(f"checkpoint: {saved}")
         self._stack.close()
         if self._stop.signal_name:
             raise SystemExit(128 + signal.Signals[self._stop.signal_name])
-
-
-def graceful_exit() -> GracefulExit:
-    """Make the stop flag that a signal sets in all processes; only rank 0 prints an answer."""
-    answer = "saving; a second signal discards all since the last checkpoint" if parallel.is_first() else ""
-    return GracefulExit(answer, parallel.all_reduce_max if parallel.num_processes() > 1 else None)

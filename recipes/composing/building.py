@@ -47,7 +47,6 @@ from dreamer_racing.modules.rssm import LatentFormat
 from dreamer_racing.training.checkpoint import load_state
 from dreamer_racing.training.directory import RunDirectory, latest_checkpoint
 from dreamer_racing.training.episodes import EpisodeTracker
-from dreamer_racing.training.following import NoReport
 from dreamer_racing.training.session import Evaluator
 
 if TYPE_CHECKING:
@@ -126,10 +125,10 @@ def make_suite(config: RunConfig, num_envs: int, seed: int, episode_steps: int |
     )
 
 
-def make_evaluator(config: RunConfig, directory: Path, learner: Learner) -> Evaluator:
-    """Make the evaluator used during training; processes other than the first get one that does nothing."""
+def make_evaluator(config: RunConfig, directory: Path, learner: Learner) -> Evaluator | None:
+    """Make the evaluator used during training, in the first process."""
     if not parallel.is_first():
-        return NoReport()
+        return None
     asked = config.evaluation
     if is_race(config):
         worlds = {**shared_env_arguments(config), "start_noise": asked.start_noise}

@@ -38,7 +38,6 @@ from dreamer_racing.machine import git_commit, is_out_of_memory, keep_freed_memo
 from dreamer_racing.terminal import follow_quietly, start_logging
 from dreamer_racing.training.checkpoint import RunCheckpointError, newest_sound
 from dreamer_racing.training.directory import PREFIX, RunDirectory, env_steps_of, latest_checkpoint, replace_text
-from dreamer_racing.training.following import LockHeldByFirst
 from dreamer_racing.training.session import Session
 
 TRAINED_ON = ("track", "task", "decoys", "init_from", *OBSERVATION_SETTINGS)
@@ -148,8 +147,8 @@ def open_session(config: RunConfig, overrides: Sequence[str]) -> Session:
     """
     config.check()
     directory = config.run_directory
-    lock = directory.claim() if parallel.is_first() else LockHeldByFirst(directory.path)
-    if parallel.is_first() and not config.resume:
+    lock = directory.claim() if parallel.is_first() else None
+    if lock is not None and not config.resume:
         with suppress(FileNotFoundError):
             newest = latest_checkpoint(directory.checkpoints)
             lock.abandon()
@@ -159,6 +158,7 @@ def open_session(config: RunConfig, overrides: Sequence[str]) -> Session:
             )
     return Session(
         config,
+        directory,
         lock,
         lambda env_steps: write_configuration(directory, config, overrides, env_steps),
         lambda resumed: make_run_loggers(config, directory, resumed),

@@ -15,7 +15,6 @@ from torchrl.record.loggers.csv import CSVLogger
 from dreamer_racing.figures.film import write_video
 from dreamer_racing.figures.loggers import LoggerConfig, Wandb, make_loggers, read_film
 from dreamer_racing.training.directory import RunDirectory
-from dreamer_racing.training.media import log_evaluation
 from dreamer_racing.training.metrics import MetricsLog
 
 OFFLINE = LoggerConfig(tensorboard=False, wandb=Wandb.offline)
@@ -46,9 +45,9 @@ def events_of(run_dir: Path):
 def test_tensorboard_shows_configuration_plots_and_films(run_dir, tmp_path):
     (sink,) = make_loggers(run_dir, LoggerConfig())
     sink.log_configuration(SETTINGS, "seed: 3\ntrack: circle\n")
-    with MetricsLog(run_dir, [sink]) as log:
-        other = CSVLogger(exp_name="other", log_dir=str(tmp_path))  # which need not know of films
-        log_evaluation([*log.loggers, other], RunDirectory(run_dir), 2000)
+    other = CSVLogger(exp_name="other", log_dir=str(tmp_path))  # which need not know of films
+    with MetricsLog(run_dir, [sink, other]) as log:
+        log.log_evaluation(2000)
         log.push({"evaluation/return_mean": 1.0})
         log.write(2000)
     events = events_of(run_dir)
@@ -105,7 +104,7 @@ def test_wandb_offline_keeps_all_and_a_resumed_run_is_the_same_run(run_dir, monk
             log.push({"loss": 1.5})
             log.write((resumed or 0) + 1000)
             if resumed:
-                log_evaluation(log.loggers, RunDirectory(run_dir), 2000)
+                log.log_evaluation(2000)
     name = json.loads(RunDirectory(run_dir).wandb_run.read_text())["id"]
     assert sink.experiment.id == name and sink.experiment.config["track"] == "circle"
     kept = sorted((run_dir / "wandb").glob(f"offline-run-*-{name}"))

@@ -85,7 +85,8 @@ class Run:
         self.events: list[tuple[str, int]] = []
         self.learner, self.on_update = Learner(), lambda updates: None
         self.on_update: Callable[[int], None]
-        self.session = session = Session(self.config, RunDirectory(path).claim(), lambda env_steps: None)
+        directory = RunDirectory(path)
+        self.session = session = Session(self.config, directory, directory.claim(), lambda env_steps: None)
         report = SimpleNamespace(make=self._evaluate, close=lambda: None)
         env = SimpleNamespace(close=lambda: None)
         rollouts, tracker = OneAhead(rollout, **ahead), EpisodeTracker(1)
