@@ -13,7 +13,6 @@ number is as before, else the replay streams are redistributed, and the other ow
 
 from __future__ import annotations
 
-import contextlib
 import logging
 import shutil
 from collections.abc import Callable, Collection, Mapping
@@ -21,12 +20,7 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from torchrl.checkpoint import (
-    Checkpoint,
-    CheckpointError,
-    GlobalRNGState,
-    StateDictCheckpointAdapter,
-)
+from torchrl.checkpoint import Checkpoint, CheckpointError, GlobalRNGState, StateDictCheckpointAdapter
 
 from dreamer_racing import parallel
 from dreamer_racing.training.directory import (
@@ -140,8 +134,7 @@ class RunCheckpoints:
         self._last_saved = final
         if first:
             try:
-                self._remove_later(final)
-                self._remove_oldest()
+                self._remove_obsolete(final)
             except OSError as error:  # the checkpoint itself is complete
                 logger.warning("Obsolete checkpoints beside %s could not be removed: %s.", final.name, error)
         return final
@@ -185,17 +178,18 @@ class RunCheckpoints:
         if not self._own:
             return load_components(self.directory if path is None else path, parts, map_location, may_lack)
         looked_at = {*parts, *self._own_names}
-        source = Path(parallel.broadcast(_path_of_sound(self.directory if path is None else path, looked_at)))
+        found = str(newest_sound(self.directory if path is None else path, looked_at)) if parallel.is_first() else ""
+        source = Path(parallel.broadcast(found))
         metadata = Checkpoint.manifest(source)["metadata"]
         own = {name: part for name, part in parts.items() if name in self._own or name == "random_state"}
-        if (saved := metadata.get(PROCESSES, 1)) != parallel.num_processes():
-            _load_sound(source, {name: part for name, part in parts.items() if name not in own}, map_location, may_lack)
-            self._redistribute(source, saved)
-        elif parallel.is_first():
-            _load_sound(source, parts, map_location, may_lack)
+        same_number = (saved := metadata.get(PROCESSES, 1)) == parallel.num_processes()
+        if same_number and parallel.is_first():
+            return _restore(source, parts, map_location, may_lack)
+        _restore(source, {name: part for name, part in parts.items() if name not in own}, map_location, may_lack)
+        if same_number:
+            _restore(source / f"{PROCESS}{parallel.rank()}", own, map_location)
         else:
-            _load_sound(source, {name: part for name, part in parts.items() if name not in own}, map_location, may_lack)
-            _load_sound(source / f"{PROCESS}{parallel.rank()}", own, map_location, ())
+            self._redistribute(source, saved)
         return metadata
 
     def _redistribute(self, source: Path, saved: int) -> None:
@@ -220,19 +214,15 @@ class RunCheckpoints:
             parallel.num_processes(),
         )
 
-    def _remove_later(self, newest: Path) -> None:
-        for path in self._complete():
-            if path.name > newest.name:
-                logger.warning("Removing %s: the run was resumed from an earlier checkpoint.", path)
-                remove(path)
-
-    def _remove_oldest(self) -> None:
-        for path in self._complete()[: -self._keep_last]:
+    def _remove_obsolete(self, newest: Path) -> None:
+        """Remove the complete checkpoints after the newest one, and the oldest before it beyond ``keep_last``."""
+        complete = [path for path in sorted(self.directory.glob(f"{PREFIX}-*")) if is_complete(path)]
+        kept = [path for path in complete if path.name <= newest.name]
+        for path in complete[len(kept) :]:
+            logger.warning("Removing %s: the run was resumed from an earlier checkpoint.", path)
             remove(path)
-
-    def _complete(self) -> list[Path]:
-        """Return the complete checkpoints, oldest first."""
-        return [path for path in sorted(self.directory.glob(f"{PREFIX}-*")) if is_complete(path)]
+        for path in kept[: -self._keep_last]:
+            remove(path)
 
 
 class BestCheckpoint:
@@ -257,15 +247,13 @@ class BestCheckpoint:
 
     def _find(self, env_steps: int) -> None:
         """Read the score of an existing best checkpoint, or move that away if it has later env_steps."""
-        with contextlib.suppress(FileNotFoundError, RunCheckpointError):  # the next evaluation replaces a damaged one
+        try:
             kept = Checkpoint.manifest(newest_sound(self.directory))["metadata"]
-            if kept["env_steps"] > env_steps:
-                self._set_aside(kept)
-            else:
-                self.score = kept["score"]
-
-    def _set_aside(self, kept: Mapping[str, Any]) -> None:
-        """Move away a best checkpoint from after the env_steps at which the run resumes."""
+        except (FileNotFoundError, RunCheckpointError):  # the next evaluation replaces a damaged one
+            return
+        if kept["env_steps"] <= env_steps:
+            self.score = kept["score"]
+            return
         aside = self.directory.with_name(self.directory.name + REPLACED)
         shutil.rmtree(aside, ignore_errors=True)
         self.directory.rename(aside)
@@ -292,34 +280,9 @@ def load_components(
 ) -> dict[str, Any]:
     """Restore some parts of a checkpoint, for example ``{"learner": learner}`` for an evaluation.
 
-    Args:
-        path: Run directory, folder of checkpoints, or one checkpoint.
-        components: Parts by the names they were saved under.
-        map_location: As in `RunCheckpoints.load`.
-        may_lack: As in `RunCheckpoints.load`.
-
-    Returns:
-        The metadata of the checkpoint, with ``env_steps``.
-
-    Raises:
-        FileNotFoundError: if there is no complete checkpoint.
-        RunCheckpointError: if all are damaged, or a part is missing or does not fit.
+    Arguments, returned metadata and errors are those of `RunCheckpoints.load`.
     """
-    return _load_sound(newest_sound(path, components), components, map_location, may_lack)
-
-
-def _load_sound(
-    source: Path, components: Mapping[str, Any], map_location: torch.device | str, may_lack: Collection[str]
-) -> dict[str, Any]:
-    """Restore some parts of a checkpoint, or of one process's folder in it, whose checksums were compared before."""
-    lacking = set(may_lack) - Checkpoint.manifest(source)["components"].keys()
-    there = {name: part for name, part in components.items() if name not in lacking}
-    return _restore(_bind(there), source, map_location)
-
-
-def _path_of_sound(path: str | Path, parts: Collection[str]) -> str:
-    """Return the path of the newest undamaged checkpoint in rank 0, and an empty string in other processes."""
-    return str(newest_sound(path, parts)) if parallel.is_first() else ""
+    return _restore(newest_sound(path, components), components, map_location, may_lack)
 
 
 def newest_sound(path: str | Path, parts: Collection[str] | None = None) -> Path:
@@ -352,17 +315,12 @@ def load_state(
 ) -> tuple[dict[str, Any], dict[str, Any]]:
     """Return the saved state of one part of a checkpoint, without an object to restore.
 
-    Args:
-        path: Run directory, folder of checkpoints, or one checkpoint.
-        part: Name that it was saved under.
-        map_location: As in `RunCheckpoints.load`.
-
     Returns:
         The state, and the metadata of the checkpoint, with ``env_steps``.
 
     Raises:
         FileNotFoundError: if there is no complete checkpoint.
-        RunCheckpointError: if it has no such part.
+        RunCheckpointError: if it has no such part, or all are damaged.
     """
     state = _PlainState()
     metadata = load_components(path, {part: state}, map_location)
@@ -393,9 +351,14 @@ def _bind(components: Mapping[str, Any]) -> Checkpoint:
     return checkpoint
 
 
-def _restore(checkpoint: Checkpoint, source: Path, map_location: torch.device | str) -> dict[str, Any]:
+def _restore(
+    source: Path, components: Mapping[str, Any], map_location: torch.device | str, may_lack: Collection[str] = ()
+) -> dict[str, Any]:
+    """Restore some parts of a checkpoint, or of one process's folder in it, whose checksums were compared before."""
+    lacking = set(may_lack) - Checkpoint.manifest(source)["components"].keys()
+    there = {name: part for name, part in components.items() if name not in lacking}
     try:
-        return checkpoint.load(source, map_location=str(map_location)).manifest["metadata"]
+        return _bind(there).load(source, map_location=str(map_location)).manifest["metadata"]
     except CheckpointError as error:
         # torch's own message advises to load the file without its safeguard
         reason = "One of its files does not contain a saved state." if "weights_only" in str(error) else error

@@ -35,6 +35,16 @@ BEGUN = ".begun"
 """File by which a process claims a folder for its results."""
 
 
+class _Below:
+    """Attribute of a `RunDirectory`: a path below its own."""
+
+    def __init__(self, name: str) -> None:
+        self._name = name
+
+    def __get__(self, directory: RunDirectory, owner: type[RunDirectory]) -> Path:
+        return directory.path / self._name
+
+
 @dataclass(frozen=True)
 class RunDirectory:
     """Layout of the folder of a run, or of its best checkpoint, which is the same.
@@ -49,15 +59,24 @@ class RunDirectory:
 
     path: Path
 
+    checkpoints = _Below(CHECKPOINTS)  # folder of checkpoints, from which the run can be resumed
+    config = _Below("config.yaml")  # resolved configuration of the latest start
+    overrides = _Below("overrides.yaml")  # list of the overrides that it was composed from
+    starts = _Below("starts.jsonl")  # a line of JSON for every start of the run; see `note_start`
+    metrics = _Below("metrics.csv")  # table of metrics over env_steps
+    evaluations = _Below("evaluations")  # folder of the results of evaluations during training
+    plots = _Below("plots")  # folder
+    videos = _Below("videos")  # folder
+    evaluation = _Below("evaluation")  # folder of an evaluation after training
+    evaluation_file = _Below(f"evaluation/{EVALUATION}")  # its numbers
+    wandb_run = _Below("wandb/run.json")  # the run's ID at W&B
+    nonfinite_batch = _Below("nonfinite_batch.pt")  # batch whose loss was not finite
+    finished = _Below("finished.json")  # marks the run as finished, including its last evaluation and metrics
+
     @classmethod
     def of(cls, checkpoint: Path) -> RunDirectory:
         """Return the directory of the run that a checkpoint belongs to."""
         return cls(checkpoint.parents[1])
-
-    @property
-    def checkpoints(self) -> Path:
-        """Folder of checkpoints, from which the run can be resumed."""
-        return self.path / CHECKPOINTS
 
     @property
     def best(self) -> RunDirectory:
@@ -72,69 +91,9 @@ class RunDirectory:
         return around if self == around.best and is_run else self
 
     @property
-    def config(self) -> Path:
-        """File of the resolved configuration of the latest start."""
-        return self.path / "config.yaml"
-
-    @property
-    def overrides(self) -> Path:
-        """File of the overrides that the configuration was composed from, a YAML list."""
-        return self.path / "overrides.yaml"
-
-    @property
-    def starts(self) -> Path:
-        """File with a line of JSON for every start of the run; see ``note_start``."""
-        return self.path / "starts.jsonl"
-
-    @property
-    def metrics(self) -> Path:
-        """Table of metrics over env_steps."""
-        return self.path / "metrics.csv"
-
-    @property
-    def wandb_run(self) -> Path:
-        """File with the run's ID at W&B."""
-        return self.path / "wandb" / "run.json"
-
-    @property
-    def evaluations(self) -> Path:
-        """Folder of the results of evaluations during training."""
-        return self.path / "evaluations"
-
-    @property
-    def plots(self) -> Path:
-        """Folder of plots."""
-        return self.path / "plots"
-
-    @property
-    def videos(self) -> Path:
-        """Folder of videos."""
-        return self.path / "videos"
-
-    @property
-    def evaluation(self) -> Path:
-        """Folder of an evaluation after training."""
-        return self.path / "evaluation"
-
-    @property
-    def evaluation_file(self) -> Path:
-        """File with the numbers of that evaluation."""
-        return self.evaluation / EVALUATION
-
-    @property
     def replay(self) -> Path:
         """Folder of this process's replay buffer during the run, with ``replay.storage=memmap``."""
         return self.path / "replay" / f"{PROCESS}{parallel.rank()}"
-
-    @property
-    def nonfinite_batch(self) -> Path:
-        """File of the batch whose loss was not finite."""
-        return self.path / "nonfinite_batch.pt"
-
-    @property
-    def finished(self) -> Path:
-        """File that marks the run as finished, including its last evaluation and metrics."""
-        return self.path / "finished.json"
 
     def claim(self) -> RunLock:
         """Create the folder if needed, and lock it for this process.
@@ -234,8 +193,7 @@ def complete_checkpoints(path: str | Path) -> list[Path]:
                 logger.warning("Skipping %s: it is not a complete checkpoint%s.", candidate, lost)
         if found:
             return found
-    run = RunDirectory(path.parent)
-    if path == run.best.path and (run.config.exists() or run.starts.exists()):
+    if (run := RunDirectory(path).run).path != path:
         raise FileNotFoundError(
             f"No complete checkpoint at {path}: the run's first evaluation writes it, and there was none yet. Wait for "
             f"it (evaluation.first=, evaluation.every=), or give {run.path} for its newest checkpoint."
