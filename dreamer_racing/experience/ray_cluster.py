@@ -50,16 +50,25 @@ class WorkersConfig:
         """Device of a worker's policy."""
         return "cuda" if self.gpus else "cpu"
 
-    def check(self) -> None:
-        """Check that ``gpus`` is at most 1 or a whole number.
+    def check(self, frames: int) -> None:
+        """Check that ``gpus`` is at most 1 or a whole number, and that weights may be two rounds old.
+
+        Args:
+            frames: env_steps of a round of all workers.
 
         Raises:
-            ValueError: It is not; the message gives an allowed number.
+            ValueError: It is not so; the message gives an allowed number.
         """
         if self.gpus > 1 and self.gpus % 1:
             raise ValueError(
                 f"workers.gpus={self.gpus:g}: a worker can have a fraction of one GPU or a whole number of GPUs, e.g. "
                 f"workers.gpus={math.floor(self.gpus)}."
+            )
+        if self.weight_interval is not None and self.weight_interval < 2 * frames:
+            raise ValueError(
+                f"workers.weight_interval={self.weight_interval}: a round of all workers is {frames} env_steps, and is "
+                f"collected while the learner trains on the one before. So weights are {2 * frames} env_steps old at "
+                "its end: set at least that, or lower rollout_steps."
             )
 
 
@@ -102,13 +111,6 @@ def _check_reachable(address: str) -> None:
         socket.create_connection((host.strip("[]"), int(port)), CONNECT_TIMEOUT).close()
 
 
-def leave() -> None:
-    """Disconnect from the cluster; a cluster that `join` started ends."""
-    import ray
-
-    ray.shutdown()
-
-
 def resources() -> tuple[list[dict[str, float]], dict[str, float]]:
     """Return the resources of each node, and the free resources of the cluster: ``CPU``, ``GPU`` and others."""
     import ray
@@ -119,13 +121,7 @@ def resources() -> tuple[list[dict[str, float]], dict[str, float]]:
 def check_resources(
     workers: int, share: WorkersConfig, nodes: Sequence[Mapping[str, float]], free: Mapping[str, float]
 ) -> None:
-    """Check that a cluster has the resources for all workers.
-
-    Args:
-        workers: Number of workers.
-        share: Resources of each worker.
-        nodes: Resources of each node.
-        free: Free resources of the whole cluster.
+    """Check that a cluster of these nodes has the resources for all workers, a ``share`` each.
 
     Raises:
         ValueError: It does not; the message gives the needed and the available resources.
@@ -217,10 +213,7 @@ def start_workers(
 def check_nodes(share: WorkersConfig, make_env: Callable[[], EnvBase], policy: DreamerPolicy) -> None:
     """Check that every node can run a worker; otherwise Ray would silently restart one there again and again.
 
-    Args:
-        share: Resources of each worker.
-        make_env: Makes the environments of a worker; every node must be able to run it.
-        policy: Policy; every node must be able to unpickle it.
+    Every node must be able to unpickle and run ``make_env``, and to unpickle the policy.
 
     Raises:
         ValueError: A node cannot; the message names the node, and what is wrong there.
@@ -253,11 +246,6 @@ def check_nodes(share: WorkersConfig, make_env: Callable[[], EnvBase], policy: D
 
 def check_versions(node: str, found: Mapping[str, str | None], here: Mapping[str, str | None]) -> None:
     """Check that a node has the versions of this process.
-
-    Args:
-        node: Name of the node.
-        found: Versions on the node.
-        here: Versions in this process.
 
     Raises:
         ValueError: They differ; the message names the node, and both versions.

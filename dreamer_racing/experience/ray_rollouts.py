@@ -32,8 +32,7 @@ from tensordict import TensorDict, TensorDictBase
 from torchrl.envs import EnvBase
 
 from dreamer_racing.experience import ray_cluster
-from dreamer_racing.experience.ray_arrays import as_arrays, unpack_rollout
-from dreamer_racing.experience.ray_worker import Request, WorkerResult
+from dreamer_racing.experience.ray_worker import Request, WorkerResult, as_arrays, unpack_rollout
 from dreamer_racing.experience.rollouts import Rollouts, WorkerError
 from dreamer_racing.modules import DreamerPolicy
 
@@ -56,7 +55,7 @@ class RayRollouts(Rollouts):
         env: Environment whose attributes are sent with every request, to be set in the workers' environments.
         settings: Dotted names of these attributes.
         weight_interval: Maximum age of weights, env_steps, when the last frame collected with them has been learned
-            from, including its own round. At least two rounds; new weights are sent no sooner than needed.
+            from, including its own round; see `WorkersConfig.check`. New weights are sent no sooner than needed.
         patience: Seconds to wait for a round.
         leaves: Whether `close` disconnects from the cluster.
 
@@ -66,9 +65,6 @@ class RayRollouts(Rollouts):
         weights_age: Age of the weights of the round delivered last, env_steps.
         processes: Host and process ID of each worker in that round.
         seconds: Time that the slowest worker took for that round.
-
-    Raises:
-        ValueError: If ``weight_interval`` is less than two rounds.
     """
 
     has_worlds = False
@@ -87,7 +83,6 @@ class RayRollouts(Rollouts):
         self.collector, self._policy, self._env, self._settings = collector, policy, env, settings
         self._workers = list(collector.remote_collectors)
         self._frames = collector.frames_per_batch * len(self._workers)
-        check_interval(weight_interval, self._frames)
         self._interval, self._patience, self._leaves = weight_interval, patience, leaves
         self._asked: list[Any] = []  # Ray references to `WorkerResult`s, one for each worker
         self._weights: Any = None  # a Ray reference
@@ -128,7 +123,9 @@ class RayRollouts(Rollouts):
         self._asked = []
         self.collector.shutdown()
         if self._leaves:
-            ray_cluster.leave()
+            import ray
+
+            ray.shutdown()  # a cluster that `join` started ends
 
     def begin_at(self, env_steps: int) -> None:
         """Continue a run that was resumed at ``env_steps``, in freshly reset environments."""
@@ -187,7 +184,7 @@ class RayRollouts(Rollouts):
         begun, reminded, pending = time.monotonic(), 0.0, asked
         while pending:
             _, pending = ray.wait(asked, num_returns=len(asked), timeout=min(LOOK, self._patience))
-            waited, late = time.monotonic() - begun, _listed([asked.index(answer) for answer in pending])
+            waited, late = time.monotonic() - begun, ", ".join(str(asked.index(answer)) for answer in pending)
             if pending and self.stopping() and waited >= STOP_TIMEOUT:
                 logger.warning("worker %s did not answer for %.0f s: this round is abandoned", late, waited)
                 return False
@@ -221,28 +218,6 @@ def _fetch(worker: int, asked: Any) -> WorkerResult:
     except ray.exceptions.RayError as error:
         reason = ray_cluster.in_a_line(error, last=True)
         raise WorkerError(f"Worker {worker} is lost and cannot be restarted ({reason}).") from error
-
-
-def check_interval(weight_interval: int, frames: int) -> None:
-    """Check that ``weight_interval`` is at least two rounds, because rounds are collected one ahead of the learner.
-
-    Args:
-        weight_interval: env_steps.
-        frames: env_steps of a round.
-
-    Raises:
-        ValueError: It is not; the message gives the minimum.
-    """
-    if weight_interval < 2 * frames:
-        raise ValueError(
-            f"workers.weight_interval={weight_interval}: a round of all workers is {frames} env_steps, and is "
-            f"collected while the learner trains on the one before. So weights are {2 * frames} env_steps old at its "
-            "end: set at least that, or lower rollout_steps."
-        )
-
-
-def _listed(workers: Sequence[int]) -> str:
-    return ", ".join(map(str, workers))
 
 
 def _resources() -> str:

@@ -15,7 +15,6 @@ from dreamer_racing.envs.race.curriculum import BodyRateSchedule
 from dreamer_racing.envs.race.starts import StartSampler
 from dreamer_racing.envs.tracks import Track, read_track, with_decoys
 from dreamer_racing.experience.ray_cluster import WorkersConfig
-from dreamer_racing.experience.ray_rollouts import check_interval
 from dreamer_racing.experience.replay import ReplayConfig, SequenceReplayConfig
 from dreamer_racing.figures.loggers import LoggerConfig
 from dreamer_racing.learners import PPOConfig, SACConfig
@@ -252,8 +251,7 @@ class WorldModelRunConfig(ReplayRunConfig):
                 f"env.num_envs={num_envs} worlds cannot be shared equally by num_workers={workers}: make it a "
                 f"multiple, e.g. env.num_envs={-(-num_envs // workers) * workers}, or choose another number of workers."
             )
-        asked.check()
-        check_interval(self.weight_interval, num_envs * self.rollout_steps)
+        asked.check(num_envs * self.rollout_steps)
 
 
 @dataclass

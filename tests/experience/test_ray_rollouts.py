@@ -17,14 +17,12 @@ from typing import Any, NamedTuple
 import pytest
 import torch
 from tensordict import TensorDict, TensorDictBase
-from torch import nn
 
 from dreamer_racing.envs.torchrl_env import DroneRacingEnv
-from dreamer_racing.experience.ray_arrays import as_arrays, as_tensors, pack_rollout, unpack_rollout
 from dreamer_racing.experience.ray_cluster import WorkersConfig as Share
 from dreamer_racing.experience.ray_cluster import check_resources, check_versions, join, start_workers
-from dreamer_racing.experience.ray_rollouts import RayRollouts, WorkerError, check_interval
-from dreamer_racing.experience.ray_worker import RayWorker, Request
+from dreamer_racing.experience.ray_rollouts import RayRollouts, WorkerError
+from dreamer_racing.experience.ray_worker import RayWorker, Request, as_arrays, pack_rollout, unpack_rollout
 from dreamer_racing.experience.replay import make_replay
 from dreamer_racing.modules import DreamerPolicy, Interface
 from dreamer_racing.training.episodes import EpisodeTracker
@@ -78,13 +76,6 @@ def test_each_observation_goes_once() -> None:
     for key in ("pixels", ("race", "crash"), "belief"):
         assert len(packed[key]) == begins.sum() < rollout.numel()
     assert packed["next", "pixels"].shape[:2] == packed["action"].shape[:2] == (3, 4)
-
-
-def test_weights_arrive_in_another_module() -> None:
-    one, other = (nn.Sequential(nn.Linear(3, 4), nn.Sequential(nn.BatchNorm1d(4))) for _ in range(2))
-    TensorDict.from_module(other).data.update_(as_tensors(sent(as_arrays(TensorDict.from_module(one)))))
-    for key, value in one.state_dict().items():
-        assert torch.equal(other.state_dict()[key], value), key
 
 
 # What is refused before workers begin, in plain words; no Ray is needed to know it.
@@ -396,9 +387,3 @@ def test_who_does_not_answer_is_waited_for_with_patience_and_shortly_by_a_run_th
     stopped = waiting()
     stopped.stopping = lambda: True
     assert next(stopped, None) is None and stopped.drain() is None
-
-
-def test_weights_newer_than_a_round_ahead_are_refused() -> None:
-    check_interval(2 * FRAMES, FRAMES)
-    with pytest.raises(ValueError, match=rf"workers\.weight_interval=39: a round .* {FRAMES} .* 40 env_steps old"):
-        check_interval(2 * FRAMES - 1, FRAMES)
