@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib.metadata
 import importlib.util
+import math
 import os
 import platform
 import re
@@ -23,6 +24,7 @@ from dreamer_racing.caches import ensure_caches, warp_cache, why_not_writable
 from dreamer_racing.commands import install_extra
 from dreamer_racing.envs.gl_variables import VARIABLES, unset_variables
 from dreamer_racing.envs.simulator.opengl import GL_LIBRARIES, loads
+from dreamer_racing.machine import available_cpus, available_memory
 
 DISTRIBUTION = "dreamer_racing"
 RECORD_BYTES = 13_570
@@ -164,14 +166,13 @@ def cuda_of_torch() -> str | None:
 
 def cores() -> Iterator[Diagnosis]:
     """Check the CPU cores, their load, the number of threads of torch, and bfloat16 instructions."""
-    available = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-    load = os.getloadavg()[0]
+    available, load = available_cpus(), os.getloadavg()[0]
     busy = load > 0.5 * available
     remedy = "other processes slow a training down; two trainings need OMP_NUM_THREADS=1 each"
     found = f"{available}, load {load:.1f}"
     yield Diagnosis("cores", Verdict.note if busy else Verdict.fine, found, remedy if busy else "")
     threads = os.environ.get("OMP_NUM_THREADS")
-    outside = (threads or "").partition(",")[0].strip()  # outer number of "4,2"; not by `machine`, which imports torch
+    outside = (threads or "").partition(",")[0].strip()  # outer number of "4,2"
     too_many = outside.isdecimal() and int(outside) > available
     found = f"OMP_NUM_THREADS={threads}" if threads else "as many as cores"
     remedy = f"OMP_NUM_THREADS={available}: more threads than cores wait for each other" if too_many else ""
@@ -184,11 +185,9 @@ def cores() -> Iterator[Diagnosis]:
 
 def memory(needed: float) -> Diagnosis:
     """Check that a run fits in memory; ``needed`` is in bytes."""
-    information = Path("/proc/meminfo")
-    if not information.exists():
+    free = available_memory("cpu")
+    if free == math.inf:
         return Diagnosis("memory", Verdict.note, f"a default run takes {needed / 1e9:.1f} GB")
-    lines = dict(line.split(":") for line in information.read_text(encoding="utf-8").splitlines())
-    free = 1024 * float(lines["MemAvailable"].split()[0])
     found = f"{free / 1e9:.1f} GB free, such a run takes {needed / 1e9:.1f}"
     remedy = "lower replay.capacity=, or replay.storage=memmap"
     return Diagnosis("memory", *_enough(found, free >= needed, remedy))

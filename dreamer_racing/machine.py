@@ -1,4 +1,4 @@
-"""The machine: its cores and memory, and its description beside measurements."""
+"""The machine: its cores and memory, and its description beside measurements. Imports torch only where it is asked."""
 
 from __future__ import annotations
 
@@ -12,9 +12,10 @@ import shutil
 import subprocess
 import sys
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-import torch
+if TYPE_CHECKING:
+    import torch
 
 GB = 1e9
 
@@ -76,23 +77,20 @@ def resident_memory() -> int | None:
 
 def available_memory(device: torch.device | str) -> float:
     """Return the bytes that can still be allocated on a device; infinity if unknown (a CPU without /proc)."""
-    device = torch.device(device)
-    if device.type == "cuda":
+    kind = str(device).partition(":")[0]
+    if kind == "cuda":
+        import torch
+
         return float(torch.cuda.mem_get_info(device)[0])
     information = Path("/proc/meminfo")
-    if device.type != "cpu" or not information.exists():
+    if kind != "cpu" or not information.exists():
         return math.inf
     lines = dict(line.split(":") for line in information.read_text().splitlines())
     return float(lines["MemAvailable"].split()[0]) * 1024
 
 
 def check_fits(size: int, device: torch.device | str, setting: str) -> None:
-    """Check that an allocation fits in the free memory of a device.
-
-    Args:
-        size: Bytes.
-        device: Where to allocate.
-        setting: The setting that asks for it, as the user wrote it.
+    """Check that ``size`` bytes, which a setting asks for (as the user wrote it), fit in the free memory of a device.
 
     Raises:
         ValueError: It does not fit; the message gives both numbers and what to change.
@@ -106,12 +104,9 @@ def check_fits(size: int, device: torch.device | str, setting: str) -> None:
 
 
 def check_space(size: int, folder: Path, setting: str) -> None:
-    """Check that files fit on the disk: a memory map that runs out of disk space would kill the process.
+    """Check that files of ``size`` bytes fit on the disk of a folder, which need not exist yet.
 
-    Args:
-        size: Bytes of all files when full.
-        folder: Folder of the files; it need not exist yet.
-        setting: The setting that asks for them, as the user wrote it.
+    A memory map that runs out of disk space would kill the process.
 
     Raises:
         ValueError: They do not fit; the message gives both numbers and what to change.
@@ -127,6 +122,8 @@ def check_space(size: int, folder: Path, setting: str) -> None:
 
 def is_out_of_memory(error: RuntimeError) -> bool:
     """Return whether an error of torch means that a CUDA device or the CPU is out of memory."""
+    import torch
+
     return isinstance(error, torch.OutOfMemoryError) or "can't allocate memory" in str(error)
 
 
@@ -145,6 +142,8 @@ PACKAGES = ("torch", "torchrl", "tensordict", "mujoco", "mujoco-warp")
 
 def provenance() -> dict[str, Any]:
     """Return machine, versions and commit as values that JSON can hold."""
+    import torch
+
     return {
         "machine": f"{platform.system()} {platform.machine()}, {_cpu()}, {torch.get_num_threads()} torch threads",
         "gpu": torch.cuda.get_device_name() if torch.cuda.is_available() else None,
