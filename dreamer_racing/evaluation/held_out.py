@@ -38,7 +38,7 @@ def measure(
     windows = replay.held_out(WINDOWS, SEEN + learner.config.imagination_horizon, RECORDS)
     if windows is None or not session.counters["updates"]:
         return numbers
-    with session.undisturbed():
+    with session.timed("measure"):
         return numbers | held_out_metrics(learner, windows)
 
 
@@ -48,7 +48,7 @@ def measure_lag(
     """Measure the world model's error on the newest ``length`` records of each world, before it trains on them."""
     if (windows := replay.newest(length)) is None:
         return {}
-    with session.undisturbed():
+    with session.timed("measure"):
         return lag.add_fresh_error(parallel.averaged(world_model_metrics(learner, windows)))
 
 

@@ -54,9 +54,6 @@ class Rollouts(Iterator[TensorDictBase]):
     def begin_at(self, env_steps: int) -> None:
         """Continue a run that was resumed at ``env_steps``."""
 
-    def wait(self) -> None:
-        """Wait until collection in progress no longer draws from this process's random generator; nothing is lost."""
-
     def drain(self) -> TensorDictBase | None:
         """Return the rollout in progress, if any, and start no other before the next ``next()``.
 

@@ -160,20 +160,13 @@ class Session:
         evaluator: Evaluator | None,
         tracker: EpisodeTracker,
         best: Sequence[str] = (),
-        may_lack: Sequence[str] = (),
         **parts: Any,
     ) -> None:
         """Register the parts of the run, which checkpoints hold; restore them if the run is resumed.
 
-        Args:
-            learner: A `Learner`.
-            env: Training environment; if workers collect, it is closed with the session and not saved.
-            rollouts: Source of rollouts.
-            evaluator: Evaluator of the learner's policy; needed in rank 0 only.
-            tracker: Finds the finished episodes in rollouts.
-            best: Names of parts that the best checkpoint holds besides the learner.
-            may_lack: Names of parts that a checkpoint may lack.
-            parts: Further parts by name, as `RunCheckpoints` takes them.
+        If workers collect, the environment is closed with the session and not saved. Ranks other than 0 have no
+        evaluator. Besides the learner, the best checkpoint holds the parts that ``best`` names. Further ``parts`` are
+        those of `RunCheckpoints`.
         """
         self.learner, self.env, self.collected = learner, env, rollouts
         self.evaluator, self.tracker = evaluator, tracker
@@ -184,7 +177,7 @@ class Session:
         path, resume = self.directory.path, self.config.resume
         self.checkpoints = RunCheckpoints(path, self.parts, self.config.checkpoint.keep, OF_EACH_PROCESS)
         if resume:
-            self.clock.total = self.checkpoints.load(resume, may_lack=(*may_lack, *ENVIRONMENT_PARTS))
+            self.clock.total = self.checkpoints.load(resume, may_lack=ENVIRONMENT_PARTS)
             updates = self.counters["updates"]
             logger.info("resumed %s at %s env_steps, %s updates", resume, f"{self.env_steps:,}", f"{updates:,}")
             rollouts.begin_at(self.env_steps)
@@ -252,11 +245,7 @@ class Session:
         self._another_follows = False
 
     def log_episodes(self, rollout: TensorDictBase) -> TensorDictBase:
-        """Log the episodes that ended in a rollout, of all processes.
-
-        Returns:
-            Finished episodes, batch ``[E]`` of `EpisodeTracker.update`.
-        """
+        """Log and return the episodes that ended in a rollout, of all processes: ``[E]`` of `EpisodeTracker.update`."""
         episodes = parallel.all_gather_rows(self.tracker.update(rollout))
         self.counters["episodes"] += len(episodes)
         self.log(self.tracker.summary(episodes), len(episodes))
@@ -296,7 +285,6 @@ class Session:
         assert self.evaluator is not None, "only rank 0 has an evaluator"
         assert self.metrics is not None, "track() makes them"
         self.learner.check_finite()
-        self.collected.wait()
         devices = [self.learner.device] if self.learner.device.type == "cuda" else []
         with self.clock.timed("evaluate"), torch.random.fork_rng(devices=devices):
             torch.manual_seed(self.config.seed)
@@ -314,13 +302,6 @@ class Session:
         shown = {label: metrics.get(f"evaluation/{name}") for label, name in names.items()}
         numbers = ", ".join(f"{label} {value:.2f}" for label, value in shown.items() if value is not None)
         self.write_line(f"evaluation at {self.env_steps:,} env_steps: {numbers}{best}")
-
-    @contextmanager
-    def undisturbed(self) -> Iterator[None]:
-        """Context of measurements that reset this process's random generator: collection does not draw meanwhile."""
-        self.collected.wait()
-        with self.clock.timed("measure"):
-            yield
 
     def write_row(self, metrics: Mapping[str, Tensor | float] | None = None) -> None:
         """Write and show a row: the averages of the metrics logged since the latest row, and of these metrics."""
@@ -347,11 +328,7 @@ class Session:
 
     @contextmanager
     def attempt(self, what: str) -> Iterator[None]:
-        """Context of a write that may fail, for example on a full disk; the failure is shown until one succeeds.
-
-        Args:
-            what: Name of what is written.
-        """
+        """Context of a named write that may fail, as on a full disk; the failure is shown until one succeeds."""
         try:
             yield
         except (OSError, RunCheckpointError) as error:
