@@ -47,7 +47,7 @@ def restore(path: str) -> Trained:
     config = trained_config(run.path)
     if not isinstance(config, WorldModelRunConfig):
         raise SystemExit(f"{checkpoint} was trained by {config.algorithm}, which has no world model.")
-    config.device, config.replay.device = "cpu", "auto"
+    config.device, config.env.device, config.replay.device = "cpu", "cpu", "auto"
     learner, counters = restore_learner(config, checkpoint, torch.device("cpu"), "trained")
     where = {
         "run": run.path.name,

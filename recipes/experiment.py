@@ -108,9 +108,7 @@ def complete_run(config: ExperimentConfig, run_dir: Path, given: list[str]) -> N
 def next_command(config: ExperimentConfig, given: list[str]) -> list[str] | None:
     """Return the command that completes a run; None if it is complete.
 
-    Args:
-        config: of the run.
-        given: overrides of the experiment; all but its own settings go to the recipe.
+    Of the given overrides of the experiment, all but its own settings go to the recipe.
 
     Raises:
         ValueError: the algorithm or the variant is unknown, or the directory holds a run with other settings.

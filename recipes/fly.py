@@ -66,11 +66,7 @@ class FlyConfig:
     seed: int = setting(0, SEED)
 
     def check(self) -> None:
-        """Refuse what would fail only after the flight.
-
-        Raises:
-            ValueError: bad value; the message names the field and what is allowed.
-        """
+        """Refuse what would fail only after the flight."""
         if self.agent is not None and self.pilot is not None:
             raise ValueError(f"pilot={self.pilot} and agent={self.agent}: give one of them.")
         if self.pilot is not None:

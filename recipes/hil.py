@@ -70,12 +70,7 @@ def main(config: HilConfig) -> None:
 
 
 def make_flyer(config: HilConfig, track: Track | None = None) -> tuple[Flyer, dict[str, Any]]:
-    """Make the flyer, and return it with its contract, which for a pilot describes its commands.
-
-    Args:
-        config: Names the flyer.
-        track: Track for a pilot; None: the one that the configuration names.
-    """
+    """Make the flyer, a pilot for another track than the configuration's if given; return it with its contract."""
     assert config.actor is not None, "checked"
     if config.actor == PILOT:
         from dreamer_racing.plant.pilot import PilotFlyer  # needs torch, unlike actors

@@ -75,12 +75,9 @@ def shared_env_arguments(config: RunConfig) -> dict[str, Any]:
 
 
 def make_env(config: RunConfig, num_envs: int | None = None, num_threads: int | None = None) -> Environment:
-    """Make the training environment.
+    """Make the training environment, of `env.num_envs` worlds by default.
 
-    Args:
-        config: resolved.
-        num_envs: number of worlds; None: `env.num_envs`.
-        num_threads: CPU threads that step and draw a race's worlds; None: one per CPU, at most `OMP_NUM_THREADS`.
+    A race's worlds are stepped and drawn by `num_threads`; None: one per CPU, at most `OMP_NUM_THREADS`.
     """
     num_envs = num_envs or config.env.num_envs
     readers = privileged_losses(config) if isinstance(config, WorldModelRunConfig) else []
@@ -181,14 +178,7 @@ def load_initial_weights(learner: WorldModelLearner, config: WorldModelRunConfig
 def make_learner(
     config: RunConfig, interface: Interface, device: torch.device | str, seed: int | None = None
 ) -> Learner:
-    """Make the learner of a configuration, for training or for restoring a checkpoint.
-
-    Args:
-        config: resolved.
-        interface: shapes of observations and actions.
-        device: of the networks.
-        seed: of the initial weights; None: the run's.
-    """
+    """Make the learner of a resolved configuration; the initial weights are by its seed unless another is given."""
     seed = config.seed if seed is None else seed
     if isinstance(config, WorldModelRunConfig):
         kind = LatentPPO if isinstance(config, LatentPPORunConfig) else DreamerV3
@@ -249,7 +239,7 @@ def make_run_replay(
         env: environment whose records it stores.
         curriculum: recomputes old rewards, if `curriculum.relabel` is set.
         batch: windows per batch, and records per window.
-        latents: format of the latents stored with the records; None: none are stored.
+        latents: as in `make_replay`.
     """
     settings, interface, shown = config.replay, Interface.of(env), env.observation_spec.keys()
     numbers = interface.vector_dim + interface.privileged_dim

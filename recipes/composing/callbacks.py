@@ -12,11 +12,7 @@ DRAWN = ("return", "success_rate", "gates", "lap_time")
 
 
 class DrawFigures(Callback):
-    """Draws the figures of `recipes/plot.py` into `figures/` of the experiment, even if a run has failed.
-
-    Args:
-        axis: of curves and comparison, as in `recipes/plot.py`.
-    """
+    """Draws the figures of `recipes/plot.py` into `figures/` of the experiment, even if a run has failed."""
 
     def __init__(self, axis: str = "env_steps") -> None:
         self._axis = axis

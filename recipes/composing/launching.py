@@ -14,7 +14,6 @@ import torch
 from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig, ListConfig, OmegaConf
 
-from composing.checks import check_overrides, check_read
 from composing.entry import as_override, merge_overrides, override_key, override_value, plain_errors
 from composing.options import command
 from composing.resolving import tune
@@ -29,11 +28,13 @@ from composing.saved import (
 from composing.schema import RunConfig, WorldModelRunConfig, is_race
 from dreamer_racing import parallel
 from dreamer_racing.commands import from_here
+from dreamer_racing.experience.replay import Storage
 from dreamer_racing.experience.rollouts import WorkerError
 from dreamer_racing.export.agents import agent_path
 from dreamer_racing.export.shipped_agent import is_agent
 from dreamer_racing.figures.loggers import RunLogger, make_loggers
 from dreamer_racing.learners.gradient_step import NonFiniteLossError
+from dreamer_racing.losses import Barlow, Image, State, Target, find_targets
 from dreamer_racing.machine import git_commit, is_out_of_memory, keep_freed_memory, out_of_memory_advice
 from dreamer_racing.terminal import follow_quietly, start_logging
 from dreamer_racing.training.checkpoint import RunCheckpointError, newest_sound
@@ -67,9 +68,8 @@ def launch(
             if not parallel.is_first():
                 follow_quietly()
             config, overrides = compose_run(config)
-            if config.resume and parallel.all_reduce_max(
-                int(is_finished(config))
-            ):  # all look before the first tidies up
+            # All processes look before the first tidies up.
+            if config.resume and parallel.all_reduce_max(int(is_finished(config))):
                 print(next_steps(cast(RunConfig, config), RunDirectory(Path(config.run_dir))))
                 return
             config = resolve(config)
@@ -100,15 +100,54 @@ def compose_run(config: DictConfig) -> tuple[DictConfig, list[str]]:
     return config, overrides
 
 
-@contextmanager
-def training_session(config: RunConfig, overrides: list[str], remedy: str) -> Iterator[Session]:
-    """Open a session for a recipe's loop, and turn errors that prevent or end it into plain messages.
+def check_overrides(config: DictConfig, overrides: Sequence[str]) -> None:
+    """Refuse a task without `env=dmc`, and a track or decoys with it: one of them would be ignored."""
+    given, suite = {override_key(override) for override in overrides}, config.env.suite
+    if suite == "race" and "task" in given:
+        raise ValueError(f"task={config.task} is for the Control Suite: add env=dmc, or leave it out to race.")
+    if suite != "race" and config.decoys:
+        raise ValueError(f"decoys={config.decoys} are for races, and env.suite={suite}: leave them out.")
+    if "track_description" in given:
+        raise ValueError("track_description= is set by the run from its track file: give track=my_track.yaml.")
+    if suite != "race" and "track" in given:
+        raise ValueError(f"track={config.track} is for races, and env.suite={suite}: leave one of them out.")
+
+
+def check_read(config: DictConfig, overrides: Sequence[str]) -> None:
+    """Refuse settings that the chosen losses and replay do not read; losses of the user's own may read all.
 
     Args:
-        config: resolved.
-        overrides: from which it was composed.
-        remedy: as in `launch`.
+        config: composed.
+        overrides: as the user wrote them; settings from the file of a group are not refused.
     """
+    targets = find_targets(config.loss.world_model)
+
+    def have(reader: type[Target]) -> bool:
+        return any(issubclass(kind, reader) or not kind.__module__.startswith("dreamer_racing.") for kind in targets)
+
+    images = have(Image) and config.env.from_pixels
+    waits = config.algorithm != "latent_ppo" or config.schedule.wait_for_model is not None
+    drift = config.loss.drift_scale == 0 or (config.replay.context and not config.model.sampled)
+    given = {override_key(override) for override in overrides}
+    for name, read, reader in (
+        ("loss.image_scale", images, "loss=reconstruction or informed, from images"),
+        ("loss.image_share", images, "loss=reconstruction or informed, from images"),
+        ("loss.privileged_scale", have(State), "loss=privileged or informed"),
+        ("loss.barlow_scale", have(Barlow), "loss=decoder_free"),
+        ("model.imagination_starts", config.algorithm == "dreamer_v3", "recipes/dreamer_v3.py, which imagines"),
+        ("model.imagination_every", config.algorithm == "dreamer_v3", "recipes/dreamer_v3.py, which imagines"),
+        ("loss.drift_scale", drift, "stored latents (replay.context=true) without sampling (model.sampled=false)"),
+        ("replay.recent_records", config.replay.recent_share > 0, "replay.recent_share above 0"),
+        ("replay.device", config.replay.storage is Storage.tensor, "replay.storage=tensor"),
+        ("schedule.wait_every", waits, "schedule.wait_for_model"),
+    ):
+        if name in given and not read and (value := OmegaConf.select(config, name)) is not None:
+            raise ValueError(f"{name}={value} is for {reader}, which is not chosen: choose that, or leave {name}= out.")
+
+
+@contextmanager
+def training_session(config: RunConfig, overrides: list[str], remedy: str) -> Iterator[Session]:
+    """Open a session for a recipe's loop, and turn errors that prevent or end it into plain messages."""
     with plain_errors():
         session = open_session(config, overrides)
     try:

@@ -71,12 +71,7 @@ def note_track(config: DictConfig) -> None:
 
 
 def resolve_baseline(config: DictConfig, num_envs: Mapping[str, int]) -> DictConfig:
-    """Fill in the settings that a baseline leaves open, by its observations, and print the choices.
-
-    Args:
-        config: of the recipe.
-        num_envs: number of worlds, for ``pixels`` and for ``state`` observations.
-    """
+    """Fill in the settings that a baseline leaves open, by its observations, and print the choices."""
     resolve_common(config, num_envs["pixels" if config.env.from_pixels else "state"])
     if config.network.size == "auto":
         sees = "images" if config.env.from_pixels else "numbers"
@@ -164,8 +159,8 @@ def changed_from_tuned(config: DictConfig, files: list[Path]) -> list[str]:
     These are the settings that its files name, and those in which it differs from ``tuned=none``.
     """
     named = {name for file in files if file.exists() for name in settings_of(cast(DictConfig, OmegaConf.load(file)))}
-    started = GlobalHydra.instance().is_initialized()  # in a running recipe
-    with nullcontext() if started else hydra.initialize_config_dir(str(CONFIG_DIR), version_base="1.3"):
+    running = GlobalHydra.instance().is_initialized()  # in a recipe
+    with nullcontext() if running else hydra.initialize_config_dir(str(CONFIG_DIR), version_base="1.3"):
         tuned = settings_of(hydra.compose(config.algorithm, [f"tuned={config.tuned}"]))
         plain = settings_of(hydra.compose(config.algorithm, ["tuned=none", f"model={tuned['model.size']}"]))
     here = settings_of(config)

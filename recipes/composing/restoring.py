@@ -1,6 +1,7 @@
 """Restore a trained policy for the recipes that fly it, and describe where their results come from."""
 
 import time
+from contextlib import closing
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from pathlib import Path
@@ -109,7 +110,7 @@ def restore(config: FlightConfig) -> Restored:
     """Restore the policy of a checkpoint, for the race that the configuration names.
 
     Raises:
-        FileNotFoundError: there is no such checkpoint or agent; the message names the included agents.
+        FileNotFoundError: there is no such checkpoint or agent, or an agent lacks a file.
         ValueError: it was not trained to race, lacks the requested weights, or the device is not available.
         TrackError: there is no such track, or no such decoys on it.
     """
@@ -129,7 +130,8 @@ def restore(config: FlightConfig) -> Restored:
     trained.env.renderer = config.renderer
     flyer: Evaluable
     if is_agent(checkpoint):
-        flyer = shipped = restore_shipped(trained, checkpoint, device)
+        with closing(_probe(trained)) as env:
+            flyer = shipped = ShippedAgent.load(checkpoint, cast(DroneRacingEnv, env), device)
         weights = choose_weights(config.weights, shipped.about["weights"], checkpoint)
         env_steps = shipped.about["env_steps"]
     else:
@@ -152,15 +154,12 @@ def restore_learner(
     Raises:
         ValueError: the checkpoint does not have the requested weights.
     """
-    config.env.device = "cpu"  # whatever it was trained on
     chosen = choose_weights(weights, kept_weights(load_state(checkpoint, "learner")[0]), checkpoint)
     if isinstance(config, WorldModelRunConfig):
         config.model.cuda_graph = False
         config.model.average_rate = (config.model.average_rate or 1.0) if chosen == AVERAGED else None
-    env = _probe(config)
-    interface = Interface.of(env)
-    env.close()
-    learner = make_learner(config, interface, device)
+    with closing(_probe(config)) as env:
+        learner = make_learner(config, Interface.of(env), device)
     counters: dict[str, int] = {}
     parts = {"learner": learner, "counters": counters}
     if not isinstance(config, WorldModelRunConfig):
@@ -175,21 +174,7 @@ def restore_learner(
     return learner, counters
 
 
-def restore_shipped(config: RunConfig, folder: Path, device: torch.device) -> ShippedAgent:
-    """Load an exported agent, for the environment of its configuration.
-
-    Raises:
-        FileNotFoundError: a file of it is missing.
-        ValueError: it was trained in an environment of another camera or control rate.
-    """
-    config.env.device = "cpu"
-    env = _probe(config)
-    try:
-        return ShippedAgent.load(folder, cast(DroneRacingEnv, env), device)
-    finally:
-        env.close()
-
-
 def _probe(config: RunConfig) -> Environment:
-    """Make an environment with one world, to read its specs."""
-    return make_env(replace(config, env=replace(config.env, start_on_line=0.0)), num_envs=1)  # planning a line is slow
+    """Make an environment with one world on the CPU, wherever it was trained, to read its specs."""
+    env = replace(config.env, device="cpu", start_on_line=0.0)  # planning a line is slow
+    return make_env(replace(config, env=env), num_envs=1)

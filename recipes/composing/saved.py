@@ -70,12 +70,8 @@ def read_yaml(path: Path, kind: type[Config]) -> Config:
 def restore_saved_settings(config: DictConfig, saved: DictConfig, given: Collection[str]) -> None:
     """Set a composed configuration to the saved values, except `MACHINE_SETTINGS` and settings that are given now.
 
-    So a resumed run keeps its settings, even if a later version has other defaults.
-
-    Args:
-        config: of the resumed run; changed in place.
-        saved: of the run so far.
-        given: names of settings and groups; with `tuned` or `budget` no saved value is kept.
+    So a resumed run keeps its settings, even if a later version has other defaults; but none once a group `tuned` or
+    `budget` is given.
     """
     if {"tuned", "budget"}.isdisjoint(given):
         for name, value in flatten(cast(dict[str, Any], OmegaConf.to_container(saved))):

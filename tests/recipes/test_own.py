@@ -207,9 +207,9 @@ def test_the_track_of_a_file_is_noted_when_a_run_begins(track: Track, tmp_path: 
 
 
 def test_track_description_cannot_be_given() -> None:
-    checks = recipe_module("composing.checks")
+    launching = recipe_module("composing.launching")
     with pytest.raises(ValueError, match=r"track_description= is set by the run from its track file"):
-        checks.check_overrides(compose("dreamer_v3"), ["track_description={}"])
+        launching.check_overrides(compose("dreamer_v3"), ["track_description={}"])
 
 
 def write(track: Track, file: Path) -> None:

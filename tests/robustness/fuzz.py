@@ -240,7 +240,7 @@ def contracts(draw: random.Random, folder: Path) -> Iterator[Callable[[], bool]]
 def overrides(draw: random.Random, folder: Path) -> Iterator[Callable[[], bool]]:
     """Yield cases that compose, resolve and check a configuration."""
     sys.path.insert(0, str(ROOT / "recipes"))
-    from composing import checks, entry, options, schema
+    from composing import entry, launching, options, schema
     from dreamer_v3 import resolve
 
     for preset in PRESETS:  # one's own reward is tried in such worlds, whose kernels are compiled once
@@ -264,7 +264,7 @@ def overrides(draw: random.Random, folder: Path) -> Iterator[Callable[[], bool]]
                 options.check_arguments("dreamer_v3", given)
                 with hydra.initialize_config_dir(config_dir, version_base="1.3"):
                     config = hydra.compose("dreamer_v3", overrides=given)
-                checks.check_overrides(config, given)
+                launching.check_overrides(config, given)
                 cast(schema.WorldModelRunConfig, OmegaConf.to_object(resolve(config))).check()
         except HydraException as error:
             return not entry.in_plain_words(error, "dreamer_v3", given)
