@@ -89,11 +89,7 @@ def is_first() -> bool:
 
 
 def check_devices(devices: Mapping[str, str]) -> None:
-    """Refuse more processes than this machine has CUDA devices, and the same device for all of them.
-
-    Args:
-        devices: Devices by the names of their settings, which the message gives.
-    """
+    """Refuse more processes than this machine has CUDA devices, and the same device, given by its setting, for all."""
     here, there = num_local_processes(), torch.cuda.device_count()
     for name, device in devices.items():
         if not device.startswith("cuda"):

@@ -67,11 +67,7 @@ def allowed_values(config: Any, name: str) -> Range | None:
 
 
 def check_settings(config: Any, prefix: str = "") -> None:
-    """Check all fields made by `setting`, of a dataclass and those nested in it.
-
-    Args:
-        config: Instance of a dataclass.
-        prefix: Prefix of the settings' names in the message.
+    """Check all fields made by `setting`, of a dataclass and those nested in it; ``prefix`` goes before their names.
 
     Raises:
         ValueError: A value is not a number, out of its range, or not whole where it must be; the message gives the
@@ -86,13 +82,7 @@ def check_settings(config: Any, prefix: str = "") -> None:
 
 
 def check_setting(name: str, value: object, allowed: Range, whole: bool = False) -> None:
-    """Check that a value is a number in a range.
-
-    Args:
-        name: Name of the setting, for the message.
-        value: Value of the setting.
-        allowed: Allowed range.
-        whole: Whether it must be a whole number.
+    """Check that the value of a setting is a number in a range, and whole if asked.
 
     Raises:
         ValueError: It is not; the message gives the setting, its value, and what is allowed.
@@ -108,11 +98,7 @@ def check_setting(name: str, value: object, allowed: Range, whole: bool = False)
 
 
 def check_numbers(whole: Mapping[str, object], real: Mapping[str, object]) -> None:
-    """Check that arguments are numbers.
-
-    Args:
-        whole: Arguments that must be whole numbers, by name.
-        real: Arguments that may be fractions, by name.
+    """Check that arguments, given by name, are numbers: ``whole`` ones, or also fractions.
 
     Raises:
         ValueError: One is not; the message gives the argument and its value.
@@ -125,11 +111,6 @@ def check_numbers(whole: Mapping[str, object], real: Mapping[str, object]) -> No
 
 def check_three(name: str, values: object, allowed: Range) -> None:
     """Check that a setting is three numbers in a range, one for each axis.
-
-    Args:
-        name: Name of the setting.
-        values: Value of the setting.
-        allowed: Allowed range of each number.
 
     Raises:
         ValueError: It is not; the message gives the setting, its value, and what is allowed.
@@ -201,13 +182,9 @@ def check_choice(name: str, value: object, known: Collection[str]) -> None:
 
 
 def import_own(name: str, asked: str) -> Any:
-    """Import a user's class or function.
+    """Import a user's class or function by its name, ``module:name``; messages call it ``asked``.
 
     The working directory is searched last, after the rest of ``sys.path``.
-
-    Args:
-        name: ``module:name``.
-        asked: Its name in messages, for example ``reward=my_rewards:smooth``.
 
     Raises:
         ValueError: If it cannot be imported; the message says which folders were searched, and what to set.

@@ -141,10 +141,8 @@ class RayRollouts(Rollouts):
             self._taken_at = self.rounds * self._frames
         settings = {name: attrgetter(name)(self._env) for name in self._settings}
         request = Request(number, [self._weights], self._taken_at, settings)
-        self._asked, self._flown_with = (
-            [worker.collect_rollout.remote(request) for worker in self._workers],
-            self._taken_at,
-        )
+        self._asked = [worker.collect_rollout.remote(request) for worker in self._workers]
+        self._flown_with = self._taken_at
 
     def _receive(self) -> TensorDictBase | None:
         """Wait for the round in progress; return None if there is none, or if it is abandoned because the run stops.

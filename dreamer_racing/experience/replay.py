@@ -75,13 +75,7 @@ class SequenceReplayConfig(ReplayConfig):
 class StreamReplay(TensorDictReplayBuffer):
     """TorchRL replay buffer over streams; build it with `make_replay`.
 
-    ``len(replay)`` is the number of records stored; a collector can use it as its ``replay_buffer``.
-
-    Args:
-        observation_keys: Keys of an observation that are stored.
-        reward_keys: Keys of rewards that are stored.
-        latents: Format in which the policy's latents are stored as each record's ``context``; None stores none.
-        **kwargs: Arguments of `TensorDictReplayBuffer`.
+    ``len(replay)`` is the number of records stored.
     """
 
     _storage: RecordStorage

@@ -97,11 +97,7 @@ class TimeLeft:
     The prefill of the replay is not counted, nor are evaluations during that half minute, because they would weigh too
     much. Once there is an estimate, evaluations count as they do in the rest of the run.
 
-    Args:
-        total: env_steps at the end of the run.
-        env_steps: env_steps at its start.
-        updates: Updates at its start.
-        clock: Function that returns the time in seconds.
+    ``env_steps`` and ``updates`` are those at the start of the run, ``total`` the env_steps at its end.
 
     Example:
         >>> left = TimeLeft(1000, clock=iter([0.0, 1.0, 10.0, 20.0, 60.0]).__next__)
@@ -210,13 +206,7 @@ class Periods:
         self.latest = dict.fromkeys(every, 0)
 
     def due(self, name: str, env_steps: int, last: bool = False) -> bool:
-        """Return whether an action is due; if so, count it as done.
-
-        Args:
-            name: Name of the action.
-            env_steps: env_steps so far.
-            last: Whether the run ends here; then an unfinished period is enough.
-        """
+        """Return whether an action is due, at the ``last`` env_steps of a run within a period too; count it as done."""
         period, latest, first = self._every[name], self.latest[name], self._first.get(name, 0)
         early = latest < first <= env_steps
         if not period or not (early or env_steps // period > latest // period or (last and env_steps > latest)):
@@ -247,12 +237,7 @@ class Interval:
 
 
 class Journal:
-    """State of periods and pending metrics as one part of a checkpoint, so that a resumed run writes the same rows.
-
-    Args:
-        periods: Periods of the run.
-        pending: Metrics that are not yet written.
-    """
+    """State of periods and pending metrics as one part of a checkpoint, so that a resumed run writes the same rows."""
 
     def __init__(self, periods: Periods, pending: PendingMetrics) -> None:
         self.periods, self.pending = periods, pending

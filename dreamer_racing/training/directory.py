@@ -49,9 +49,6 @@ class _Below:
 class RunDirectory:
     """Layout of the folder of a run, or of its best checkpoint, which is the same.
 
-    Args:
-        path: The folder.
-
     Example:
         >>> RunDirectory(Path("runs/example")).metrics
         PosixPath('runs/example/metrics.csv')
@@ -232,17 +229,10 @@ def replace_text(path: Path, text: str) -> None:
 
 
 def ensure_writable(directory: str | Path, setting_name: str = "run_dir") -> Path:
-    """Create a folder if needed, and test that it is writable, to fail before a run and not at its first checkpoint.
-
-    Args:
-        directory: The folder.
-        setting_name: Name of the setting that chooses the folder, for the message.
-
-    Returns:
-        The absolute path of the folder.
+    """Create a folder if needed, test that it is writable, and return its absolute path.
 
     Raises:
-        PermissionError: If the folder is not writable.
+        PermissionError: It is not; the message advises to choose another by ``setting_name``.
     """
     directory = Path(directory).expanduser().absolute()
     try:
@@ -273,11 +263,8 @@ def is_complete(path: Path) -> bool:
 def fresh_directory(path: str | Path, result: str) -> Path:
     """Return an empty folder to write to: the given one, or if it is not empty, the first free `<name>_2`, ...
 
-    So results are not mixed with those of an earlier, killed or concurrent evaluation.
-
-    Args:
-        path: Requested folder.
-        result: Name of the file that is written last.
+    So results, of which the file ``result`` comes last, are not mixed with those of an earlier, killed or concurrent
+    evaluation.
     """
     asked = Path(path).expanduser().absolute()
     for number in count(1):
@@ -303,20 +290,13 @@ class RunLock:
         directory: Existing run directory.
         made: Whether the directory was created for this lock.
 
-    Attributes:
-        directory: As given.
-
     Raises:
         ValueError: A live process holds the lock; the message names it.
-
-    Example:
-        >>> lock = RunLock("runs/example")  # doctest: +SKIP
     """
 
     def __init__(self, directory: str | Path, made: bool = False) -> None:
-        self.directory = Path(directory)
-        self._made = made
-        self._file = (self.directory / ".lock").open("a+", encoding="utf-8")
+        self._directory, self._made = Path(directory), made
+        self._file = (self._directory / ".lock").open("a+", encoding="utf-8")
         try:
             fcntl.flock(self._file, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError as error:
@@ -341,7 +321,7 @@ class RunLock:
         """Release the lock, and remove the folder if it was created for this lock and holds nothing else."""
         path = Path(self._file.name)
         with suppress(OSError):  # the folder stays then
-            if self._made and list(self.directory.iterdir()) == [path]:
+            if self._made and list(self._directory.iterdir()) == [path]:
                 path.unlink()
-                self.directory.rmdir()
+                self._directory.rmdir()
         self.release()

@@ -78,14 +78,7 @@ class EpisodeTracker:
         return TensorDict(episodes, batch_size=[len(env)])[order]
 
     def summary(self, episodes: TensorDictBase) -> dict[str, float]:
-        """Return metrics of finished episodes: means, and the share of episodes that ended by each crash cause.
-
-        Args:
-            episodes: Batch ``[E]`` of `update`.
-
-        Returns:
-            ``episode/return``, ``episode/length``, ``episode/gates_passed``, ``crash/<cause>``; empty if E = 0.
-        """
+        """Return means over finished episodes ``[E]``, and the share that ended by each crash cause; none if E = 0."""
         if not len(episodes):
             return {}
         names = [name for name in ("return", "length", "gates_passed") if name in episodes]
@@ -161,12 +154,7 @@ class GatePassRate:
         self._attempts = torch.zeros(num_gates, dtype=torch.float64)  # (G,)
 
     def update(self, episodes: TensorDictBase, env_steps: int) -> float:
-        """Update the rates by finished episodes; return the lowest rate.
-
-        Args:
-            episodes: Batch ``[E]`` of ``EpisodeTracker.update``.
-            env_steps: env_steps so far.
-        """
+        """Update the rates by finished episodes, batch ``[E]`` of `EpisodeTracker.update`; return the lowest rate."""
         num_gates = len(self._passes)
         if not num_gates or not len(episodes):
             return self.share
@@ -192,10 +180,6 @@ class GatePassRate:
 
         This prevents a deadlock: if gates are only missed because of a large standard deviation of actions, their pass
         rate does not rise until the schedule lowers that standard deviation.
-
-        Args:
-            env_steps: env_steps so far.
-            total_env_steps: Length of the whole run.
         """
         if self.known_since is None:
             return self.best

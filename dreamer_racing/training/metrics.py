@@ -83,9 +83,6 @@ class MetricsLog:
     def close_row(self, env_steps: int) -> dict[str, float]:
         """Make a row of the averages, which `flush` writes, and start new averages. Waits for the device once.
 
-        Args:
-            env_steps: Control steps summed over environments.
-
         Returns:
             The averages by name; empty, without a new row, if nothing was pushed.
         """
@@ -310,9 +307,6 @@ class MetricsTable:
 def read_rows(path: Path) -> tuple[list[str], list[list[str]], list[str]]:
     """Read the complete rows; the last one may be truncated by a kill, or still being written.
 
-    Args:
-        path: The file.
-
     Returns:
         The header, the rows with as many cells as it has, and descriptions of what was left out.
 
@@ -338,11 +332,7 @@ def read_rows(path: Path) -> tuple[list[str], list[list[str]], list[str]]:
 
 
 def read_metrics(path: str | Path, wanted: Collection[str] | None = None) -> MetricsTable:
-    """Read columns of a `metrics.csv` as numbers, in the order of env_steps.
-
-    Args:
-        path: The file.
-        wanted: Names of columns; None for all. Those that the file does not have are left out.
+    """Read the wanted columns of a `metrics.csv` that it has, or all, as numbers, in the order of env_steps.
 
     Raises:
         ValueError: The file is not a table of metrics, or has no rows.

@@ -17,13 +17,7 @@ from dreamer_racing.training.signals import say_at_once, write_at_once
 
 
 class Shown(NamedTuple):
-    """Metrics of a column.
-
-    Attributes:
-        training: Metric of training episodes or updates, or None.
-        evaluation: Metric of evaluations, or None.
-        form: Format specification of the number.
-    """
+    """Metrics of a column, of training and of evaluations, and the format of their numbers."""
 
     training: str | None
     evaluation: str | None
@@ -151,10 +145,6 @@ class LiveTable:
     """Progress bar, a table with the rows training and evaluation, and a bar during evaluations, in a terminal.
 
     Log messages are written above it.
-
-    Args:
-        total: env_steps at the end of the run.
-        env_steps: env_steps at its start, if it is resumed.
     """
 
     def __init__(self, total: int, env_steps: int = 0) -> None:

@@ -66,22 +66,14 @@ class Ramp:
     def check(self, name: str) -> None:
         """Check that 0 <= begin <= end <= 1.
 
-        Args:
-            name: Name of the hyperparameter, for the message.
-
         Raises:
-            ValueError: It is not so; the message gives both ends.
+            ValueError: It is not so; the message gives name and both ends.
         """
         if not 0.0 <= self.begin <= self.end <= 1.0:
             raise ValueError(f"{name}: begin={self.begin} and end={self.end} must satisfy 0 <= begin <= end <= 1.")
 
     def at(self, value: float, times: Mapping[RampClock, float]) -> float:
-        """Return the value at a time.
-
-        Args:
-            value: Configured value, from which the ramp starts.
-            times: Time of each clock; above 1 counts as 1.
-        """
+        """Return the value to which the ramp has moved a configured one, by the times of all clocks."""
         if self.to is None:
             return value
         progress = times[self.by]
@@ -145,9 +137,6 @@ class ScheduleConfig:
         """Check that ``min_std`` stays below ``max_std`` during the ramps of both.
 
         If both ramps have the same clock and times, the bounds are compared at begin and end, else in all combinations.
-
-        Args:
-            loss: Configuration with both bounds.
 
         Raises:
             ValueError: It does not; the message names both settings.
@@ -243,12 +232,7 @@ class Schedule:
         self.pass_rate = GatePassRate(num_gates)
 
     def observe(self, episodes: TensorDictBase, env_steps: int) -> dict[str, float]:
-        """Update the gate pass rate, which some ramps depend on, by finished episodes; return metrics.
-
-        Args:
-            episodes: Batch ``[E]`` of ``EpisodeTracker.update``.
-            env_steps: env_steps so far.
-        """
+        """Update the gate pass rate by finished episodes, batch ``[E]`` of `EpisodeTracker.update`; return metrics."""
         if not len(episodes) or "gates_passed" not in episodes:
             return {}
         share = self.pass_rate.update(episodes, env_steps)
@@ -378,11 +362,8 @@ class ModelLag:
     def add_fresh_error(self, metrics: Mapping[str, Tensor]) -> dict[str, Tensor | float]:
         """Add the error on the newest records, decide whether the policy waits, and log changes of the decision.
 
-        Args:
-            metrics: Metrics of the world model on these records, with one of `ERRORS`.
-
         Returns:
-            Metrics, of which the ratio is the median of the latest ones; empty if there is no such error.
+            Metrics, of which the ratio is the median of the latest ones; empty if none of `ERRORS` is among the given.
         """
         if (fresh := error_of(metrics)) is None:
             return {}
