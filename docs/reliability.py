@@ -50,8 +50,7 @@ TESTS = {
     ),
     "power loss, or the machine is taken away": ("test_checkpoints_by_the_clock",),
     "a file of a checkpoint is damaged or missing": (
-        "test_every_damaged_file_is_noticed_and_the_checkpoint_before_it_is_taken",
-        "test_every_missing_file_is_noticed_and_the_checkpoint_before_it_is_taken",
+        "test_every_damaged_or_missing_file_is_noticed_and_the_checkpoint_before_it_is_taken",
         "test_json_of_another_kind_is_damage",
     ),
     "the disk fills up": (

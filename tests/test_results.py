@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import re
 from pathlib import Path
 from types import ModuleType
 
@@ -41,12 +40,6 @@ def change(folder: Path, **fields) -> None:
 def test_page_in_the_repository_is_up_to_date(results):
     page = (ROOT / "docs" / "results.md").read_text(encoding="utf-8")
     assert page == results.make_page(ROOT / "results"), "run python docs/results.py"
-
-
-def test_links_of_the_page_lead_somewhere():
-    page = (ROOT / "docs" / "results.md").read_text(encoding="utf-8")
-    targets = {target for target in re.findall(r"\]\(([^)#]+)", page) if not target.startswith("http")}
-    assert targets and all((ROOT / "docs" / target).exists() for target in targets)
 
 
 def test_every_result_is_on_the_page(results):

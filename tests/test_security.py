@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import ast
-import os
 import re
 from pathlib import Path
 
@@ -15,22 +14,13 @@ from dreamer_racing.evaluation.dreams import Dream
 from dreamer_racing.hil.configuration import HilConfig
 from dreamer_racing.plant.process import ProcessOptions
 from tests.running_recipes import recipe_module
+from tests.training.test_checkpoint import Payload
 
 ROOT = Path(__file__).parents[1]
 RUNS_TEXT = {"eval", "exec", "compile", "__import__"}
 UNPICKLES = {"pickle", "cPickle", "dill", "cloudpickle", "joblib", "shelve", "marshal"}
 OWN_MEMORY = {"dreamer_racing/hil/view.py": ["marshal"]}  # between a flight and its own child, in memory they share
 SOURCES = [*(ROOT / "dreamer_racing").rglob("*.py"), *(ROOT / "recipes").rglob("*.py")]
-
-
-class Payload:
-    """What a pickle that runs code looks like."""
-
-    def __init__(self, witness: Path) -> None:
-        self._witness = witness
-
-    def __reduce__(self) -> tuple:
-        return (os.system, (f"touch {self._witness}",))
 
 
 def suspicious(tree: ast.AST) -> list[str]:

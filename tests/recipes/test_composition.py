@@ -14,7 +14,7 @@ from dreamer_racing.envs.tracks import load_track
 from dreamer_racing.figures.runs import flatten
 from dreamer_racing.modules import Interface
 from dreamer_racing.training.episodes import GatePassRate
-from dreamer_racing.training.schedule import DreamerV3ScheduleConfig, RampClock, Schedule
+from dreamer_racing.training.schedule import DreamerV3ScheduleConfig, Schedule
 from tests.running_recipes import CONFIG, EXPERIMENTS, build, compose, prepared, recipe_module
 
 
@@ -174,13 +174,6 @@ def test_tuned_race_works_with_other_actors(name: str, override: str) -> None:
 
 
 def test_the_command_line_overrides_tuned_race() -> None:
-    tuned = compose("latent_ppo", "tuned=race")
-    assert (tuned.model.size, tuned.loss.world_model, tuned.loss.privileged_scale) == ("cpu_small", "privileged", 50)
-    assert (tuned.env.control_rate, tuned.env.start_on_line, tuned.loss.discount) == (25, 0.7, 0.98)
-    assert (tuned.loss.critic, tuned.model.sampled, tuned.replay.context) == ("state", False, True)
-    assert (tuned.env.start_at_gate, tuned.schedule.start_on_line.to) == (0, 0)
-    assert (tuned.schedule.wait_for_model, tuned.loss.drift_scale) == (2, 1)
-    assert (tuned.model.state_std, tuned.schedule.max_std.by) == (False, RampClock.known)
     changed = compose("latent_ppo", "tuned=race", "loss=informed", "env.control_rate=50")
     assert (changed.loss.world_model, changed.env.control_rate, changed.loss.discount) == ("informed", 50, 0.98)
 
@@ -237,15 +230,11 @@ def test_tuned_none_is_dreamer_as_published() -> None:
 @pytest.mark.parametrize(
     ("overrides", "expected"),
     [
-        (["track=kidney"], "race"),
         (["track=kidney", "env=faithful", "loss=informed", "budget=cpu"], "race"),
-        (["model=debug"], "none"),
-        (["model=size12m"], "none"),
         (["model=cpu_small"], "race"),
         (["budget=smoke"], "none"),
         (["env.from_pixels=false"], "none"),
         (["env=dmc", "task=walker_walk"], "suite"),
-        (["env=dmc", "env.from_pixels=false"], "none"),
     ],
 )
 def test_tuned_auto_chooses_by_environment_budget_and_model(
@@ -328,13 +317,6 @@ def test_what_the_chosen_losses_do_not_have_moves_only_if_it_is_asked_for():
     ]
 
 
-def test_ramps_by_gates_are_refused_without_gates():
-    overrides = ["env=dmc", "model=debug", "device=cpu", "schedule.discount.to=0.9", "schedule.discount.by=passes"]
-    config = OmegaConf.to_object(recipe_module("dreamer_v3").resolve(compose("dreamer_v3", *overrides)))
-    with pytest.raises(ValueError, match=r"schedule.discount.by=passes depends on gates, and env.suite=dmc has none"):
-        config.check()
-
-
 def test_a_run_begins_with_the_weights_that_restoring_makes_before_it_loads_any(tmp_path: Path) -> None:
     """What trains and what restores a learner make it alike."""
     overrides = ["tuned=none", "model=debug", "device=cpu", "env.from_pixels=false", "loss=informed", "seed=7"]
@@ -384,21 +366,15 @@ def test_records_in_files_lie_in_the_run_directory_as_long_as_the_run_goes_on(tm
     assert not (tmp_path / "run" / "replay" / "process-0").exists()
 
 
-def test_a_run_that_is_refused_leaves_no_folder(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    with pytest.raises(SystemExit):
-        build("init_from=nowhere", f"run_dir={tmp_path / 'run'}")
-    assert "init_from=nowhere" in capsys.readouterr().err and not any(tmp_path.iterdir())
-
-
-def test_a_run_that_is_refused_leaves_what_was_there_and_its_lock_to_the_next(
+def test_a_run_that_is_refused_leaves_no_folder_but_what_was_there(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     (tmp_path / "log.txt").touch()
-    for _ in range(2):
+    for place in (tmp_path / "run", tmp_path, tmp_path):  # its lock is left to the next
         with pytest.raises(SystemExit):
-            build("init_from=nowhere", f"run_dir={tmp_path}")
+            build("init_from=nowhere", f"run_dir={place}")
         assert "init_from=nowhere" in capsys.readouterr().err
-    assert (tmp_path / "log.txt").exists()
+        assert not (tmp_path / "run").exists() and (tmp_path / "log.txt").exists()
 
 
 def test_settings_that_differ_from_a_derived_tuned_file_are_printed(capsys: pytest.CaptureFixture[str]) -> None:
@@ -414,17 +390,14 @@ def test_settings_that_differ_from_a_derived_tuned_file_are_printed(capsys: pyte
     assert "env.start_on_line=0.7 (0.0)" in line, "the file sets the value that tuned=none has, too"
 
 
-def test_settings_are_said_of_the_algorithm_that_is_trained(capsys: pytest.CaptureFixture[str]) -> None:
-    recipe_module("dreamer_v3").resolve(compose("dreamer_v3", "tuned=race", "device=cpu"))
-    told = capsys.readouterr().out
-    assert "settings: tuned=race, for DreamerV3 on races" in told and "latent PPO" not in told
-
-
 def test_settings_that_differ_from_tuned_are_printed(capsys: pytest.CaptureFixture[str]) -> None:
     """Nothing for the settings as they are; else each with what the file has, also of a group that it takes."""
     recipe = recipe_module("latent_ppo")
     recipe.resolve(compose("latent_ppo", "tuned=race", "track=kidney", "seed=3", "device=cpu"))
     assert "settings that differ" not in capsys.readouterr().out
+    recipe_module("dreamer_v3").resolve(compose("dreamer_v3", "tuned=race", "device=cpu"))
+    told = capsys.readouterr().out
+    assert "settings: tuned=race, for DreamerV3 on races" in told and "latent PPO" not in told
     changed = ["loss=reconstruction", "loss.critic=latent", "schedule.kl_target.to=null", "replay.context=false"]
     recipe.resolve(compose("latent_ppo", "tuned=race", "device=cpu", "loss.drift_scale=0", *changed))
     (line,) = (line for line in capsys.readouterr().out.splitlines() if "settings that differ" in line)

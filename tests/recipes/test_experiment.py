@@ -73,12 +73,18 @@ def test_damaged_overrides_are_refused_in_words(tmp_path: Path, content: bytes) 
         next_command(tmp_path, *CHOSEN)
 
 
-def test_an_unfinished_run_is_resumed_and_a_finished_one_skipped(tmp_path: Path) -> None:
-    run_dir = leave_run(tmp_path / RUN, 999_999, OVERRIDES, finished=False)
+@pytest.mark.parametrize("env_steps", [999_999, 1_000_000], ids=["on the way", "in its last evaluation"])
+def test_an_unfinished_run_is_resumed_and_a_finished_one_skipped_unless_more_is_asked_for(
+    env_steps: int, tmp_path: Path
+) -> None:
+    spelt = [*OVERRIDES[:-1], "env.from_pixels=False"]
+    run_dir = leave_run(tmp_path / RUN, env_steps, spelt, finished=False)
     assert next_command(tmp_path, *CHOSEN) == ["sac.py", f"resume={run_dir}", "total_env_steps=1000000"]
     RunDirectory(run_dir).mark_finished(1_000_000)
     assert next_command(tmp_path, *CHOSEN) is None
     assert next_command(tmp_path, *CHOSEN, "total_env_steps=900000") is None
+    more = next_command(tmp_path, *CHOSEN, "total_env_steps=3000000")
+    assert more == ["sac.py", f"resume={run_dir}", "total_env_steps=3000000"]
 
 
 def test_a_run_goes_on_for_as_long_as_its_recipe_chose(tmp_path: Path) -> None:
@@ -94,23 +100,6 @@ def test_a_run_goes_on_for_as_long_as_its_recipe_chose(tmp_path: Path) -> None:
     assert next_command(tmp_path, *chosen) == ["dreamer_v3.py", f"resume={run_dir}", f"total_env_steps={length}"]
     RunDirectory(run_dir).mark_finished(length)
     assert next_command(tmp_path, *chosen) is None
-
-
-def test_a_run_that_was_killed_in_its_last_evaluation_is_not_finished(tmp_path: Path) -> None:
-    run_dir = leave_run(tmp_path / RUN, 1_000_000, OVERRIDES, finished=False)
-    assert next_command(tmp_path, *CHOSEN) == ["sac.py", f"resume={run_dir}", "total_env_steps=1000000"]
-
-
-def test_an_override_may_be_spelt_in_several_ways(tmp_path: Path) -> None:
-    leave_run(tmp_path / RUN, 1_000_000, [*OVERRIDES[:-1], "env.from_pixels=False"])
-    assert next_command(tmp_path, *CHOSEN) is None
-
-
-def test_a_finished_run_goes_on_when_more_is_asked_for(tmp_path: Path) -> None:
-    run_dir = leave_run(tmp_path / RUN, 1_000_000, OVERRIDES)
-    assert next_command(tmp_path, *CHOSEN) is None
-    more = next_command(tmp_path, *CHOSEN, "total_env_steps=3000000")
-    assert more == ["sac.py", f"resume={run_dir}", "total_env_steps=3000000"]
 
 
 def test_a_run_with_other_settings_is_not_continued(tmp_path: Path) -> None:
@@ -189,14 +178,7 @@ def test_all_algorithms_run_once_and_only_once(tmp_path: Path) -> None:
         assert f"{run_dir}: finished, skipped" in second.stdout
         table = rows(run_dir)
         assert int(table[-1]["env_steps"]) >= 640
-        for column in (
-            "loss",
-            "episode/return",
-            "evaluation/success_rate",
-            "curriculum/body_rate_weight",
-            "wall_clock",
-            "cpu_clock",
-        ):
+        for column in ("loss", "episode/return", "evaluation/success_rate", "curriculum/body_rate_weight", "cpu_clock"):
             assert any(row[column] for row in table), f"{algorithm}: {column}"
         assert list((run_dir / "videos").glob("*.mp4")) and list((run_dir / "plots").glob("*.png"))
         assert OmegaConf.load(run_dir / "config.yaml").algorithm == algorithm

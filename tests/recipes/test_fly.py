@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -92,23 +91,6 @@ def test_a_flight_that_is_refused_leaves_no_folder(refused, tmp_path, monkeypatc
         with pytest.raises(SystemExit):
             fly.fly(fly.FlyConfig(run_dir=run_dir, **refused))
         assert [path.name for path in tmp_path.rglob("*")] == ["mine"]
-
-
-def test_a_folder_to_which_something_was_written_stays(tmp_path) -> None:
-    fly = recipe_module("fly")
-    with fly.folder_to_fill(tmp_path / "runs" / "fly") as directory:
-        (directory / "evaluation.json").write_text("{}")
-    assert (tmp_path / "runs" / "fly" / "evaluation.json").exists()
-
-
-@pytest.mark.slow
-def test_the_refusal_as_a_user_meets_it(tmp_path) -> None:
-    if os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"):
-        pytest.skip("there is a display here")
-    done = recipe("fly", "agent=kidney", "viewer=true", cwd=tmp_path)
-    assert done.returncode == 2 and done.stdout == "" and done.stderr.count("\n") == 1
-    assert done.stderr.startswith("error: The viewer cannot open a window here: ")
-    assert not list(tmp_path.iterdir())
 
 
 def test_a_view_that_there_is_not_is_refused_before_the_flight() -> None:

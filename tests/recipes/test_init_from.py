@@ -98,14 +98,16 @@ def test_what_does_not_fit_is_refused(
     assert all(word in said for word in words), said
 
 
-def test_a_run_at_another_rate_is_refused(trained: Path, capsys: pytest.CaptureFixture[str]) -> None:
+@pytest.mark.parametrize(
+    ("overrides", "words"),
+    [
+        (["env.control_rate=25"], "env.control_rate=25.0: init_from="),
+        (["model=size1m", "model.batch_length=8", "model.batch_size=2"], "Weights cannot be converted between sizes"),
+    ],
+)
+def test_a_run_at_another_rate_or_of_another_size_is_refused(
+    overrides: list[str], words: str, trained: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     with pytest.raises(SystemExit):
-        build(*TINY, *NUMBERS, f"run_dir={trained.parent / 'next'}", f"init_from={trained}", "env.control_rate=25")
-    assert "env.control_rate=25.0: init_from=" in capsys.readouterr().err
-
-
-def test_a_run_of_another_size_is_refused(trained: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    with pytest.raises(SystemExit):
-        build(*TINY, *NUMBERS, f"run_dir={trained.parent / 'next'}", f"init_from={trained}", "model=size1m",
-              "model.batch_length=8", "model.batch_size=2")  # fmt: skip
-    assert "Weights cannot be converted between sizes" in capsys.readouterr().err
+        build(*TINY, *NUMBERS, f"run_dir={trained.parent / 'next'}", f"init_from={trained}", *overrides)
+    assert words in capsys.readouterr().err

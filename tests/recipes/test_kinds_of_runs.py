@@ -198,15 +198,6 @@ def test_a_run_without_images(tmp_path: Path) -> None:
     assert "another loss or other observations" in done.stderr
 
 
-@pytest.mark.slow
-def test_a_run_on_small_images(tmp_path: Path) -> None:
-    done = recipe("dreamer_v3", *TINY, "env.image_size=32", AT_THE_END, "run_dir=run", cwd=tmp_path)
-    assert done.returncode == 0, done.stderr
-    last = [row for row in rows(tmp_path / "run") if row["loss_image"]][-1]
-    assert float(last["loss_image"]) == pytest.approx(float(last["image_error"]) * 32 * 32 * 3, rel=1e-3)
-    assert list((tmp_path / "run" / "videos").glob("*.mp4"))
-
-
 POISON = """
 from dreamer_racing.envs.torchrl_env import DroneRacingEnv
 step, steps = DroneRacingEnv._step, []

@@ -38,9 +38,7 @@ REFUSED = [
     (["workers.cpus=2"], ["workers.cpus=2", "is for collector=ray"]),
     (["collector=ray", "num_workers=3"], ["env.num_envs=32", "num_workers=3", "env.num_envs=33"]),
     (["collector=ray", "workers.weight_interval=500"], ["weight_interval=500", "256 env_steps", "512 env_steps old"]),
-    (["collector=ray", "workers.cpus=0"], ["workers.cpus=0", "above 0"]),
     (["collector=ray", "workers.gpus=1.5"], ["workers.gpus=1.5", "fraction of one GPU", "workers.gpus=1."]),
-    (["collector=ray", "num_workers=0"], ["num_workers=0", "at least 1"]),
     (["env.looks=pretty", "env.from_pixels=true"], ["pretty", "nominal", "randomised"]),
     (["env.looks=randomised", "env.from_pixels=false"], ["env.looks=randomised", "nominal"]),
     (["loss.actor=magic"], ["magic", "reinforce"]),
@@ -50,23 +48,16 @@ REFUSED = [
         ["loss.actor=reinforce learns from imagined steps: use it with recipes/dreamer_v3.py"],
     ),
     (["loss.actor=flown_ppo"], ["'flown_ppo' was removed", "use recipes/latent_ppo.py"]),
-    (["model.replay_ratio=0"], ["model.replay_ratio=0", "above 0"]),
     (["model.replay_ratio=inf"], ["model.replay_ratio=inf", "above 0, and finite"]),
     (["prefill=100", "env.num_envs=8"], ["prefill=100", "12 records", "batch_length=16", "at least 128"]),
     (["prefill=4000", "total_env_steps=4000"], ["total_env_steps=4000", "above prefill=4000"]),
-    (["env.num_envs=0"], ["env.num_envs=0", "at least 1"]),
-    (["model.batch_length=1"], ["model.batch_length=1", "at least 2"]),
-    (["model.learning_rate=-1"], ["model.learning_rate=-1", "above 0"]),
     (["env.image_size=0"], ["env.image_size=0", "multiple of 16"]),
     (["env.image_size=40"], ["env.image_size=40", "multiple of 16", "32, 64 or 96"]),
-    (["loss.discount=1.5"], ["loss.discount=1.5", "at least 0 and at most 1"]),
-    (["checkpoint.keep=0"], ["checkpoint.keep=0", "at least 1"]),
     (["loss.world_model=nowhere:Loss"], ["nowhere:Loss", "was not found", "set PYTHONPATH"]),
     (["prefill=512", "total_env_steps=527"], ["total_env_steps=527", "64 records"]),  # 15 × 4 are less than 4 × 16
     (["replay.capacity=100000000000"], ["replay.capacity=100,000,000,000", " GB when full", "left", "memmap"]),
     (["replay.capacity=100"], ["capacity=100", "batch_length=16", "at least 512"]),
     (["replay.held_out=32"], ["held_out=32", "num_envs=32"]),
-    (["replay.recent_share=1.5"], ["recent_share=1.5", "at least 0 and at most 1"]),
     (["env.suite=atari"], ["env.suite=atari", "race", "dmc"]),
     (["env=dmc", "env.from_pixels=false", "loss=privileged"], ["loss.world_model=privileged", "reconstruction"]),
     (["env=dmc", "task=walker_fly"], ["walker_fly", "walker_walk"]),
@@ -75,9 +66,6 @@ REFUSED = [
     (["env.control_rate=5"], ["env.control_rate=5", "at least 10"]),
     (["env.control_rate=inf"], ["env.control_rate=inf Hz: must be a finite number"]),
     (["env.control_rate=60"], ["env.control_rate=60", "whole number of physics steps of 2 ms"]),
-    (["env.start_on_line=1.5"], ["env.start_on_line=1.5", "at least 0 and at most 1"]),
-    (["env.start_at_gate=1.5"], ["env.start_at_gate=1.5", "at least 0 and at most 1"]),
-    (["env.start_beyond_gate=-0.1"], ["env.start_beyond_gate=-0.1", "at least 0 and at most 1"]),
     (["env.start_on_line=1", "env.start_beyond_gate=0.5"], ["env.start_beyond_gate=0.5", "env.start_on_line=1 leaves"]),
     (["env.start_on_line=0.5", "schedule.start_on_line.to=2"], ["schedule.start_on_line.to=2.0: must be at least 0"]),
     (["schedule.discount.begin=0.6", "schedule.discount.end=0.5"], ["schedule.discount: begin=0.6 and end=0.5"]),
@@ -86,10 +74,8 @@ REFUSED = [
     (["loss.actor=asymmetric_ppo"], ["'asymmetric_ppo' was removed: use recipes/latent_ppo.py loss.critic=state."]),
     (["tuned=images", "env.from_pixels=false"], ["tuned=images is for agents that see images", "leave one out"]),
     (["env=dmc", "loss.critic=state"], ["loss.critic=state: read", "loss.critic=latent"]),
-    (["schedule.world_model_rate.to=0"], ["schedule.world_model_rate.to=0.0: must be above 0"]),
     (["schedule.imagination_horizon.to=0"], ["schedule.imagination_horizon.to=0.0: must be at least 1"]),
     (["loss.open_loop_steps=16"], ["loss.open_loop_steps=16", "less than", "model.batch_length=16"]),
-    (["loss.ppo.steps=0"], ["loss.ppo.steps=0: must be at least 1"]),
     (["loss.ppo.kl_target=0.03"], ["loss.ppo.kl_stop=0.03 must be at least 1.5 times loss.ppo.kl_target=0.03"]),
     (
         ["loss.ppo.kl_target=0.01", "schedule.kl_target.to=0.03"],
@@ -100,12 +86,15 @@ REFUSED = [
     (["model.average_rate=5"], ["model.average_rate=5.0: must be above 0 and at most 1"]),
     (["loss.min_std=0.5", "loss.max_std=0.5"], ["loss.min_std=0.5 must be below loss.max_std=0.5"]),
     (["loss.min_std=0.3", "schedule.max_std.to=0.15"], ["loss.min_std=0.3 must be below schedule.max_std.to=0.15"]),
-    (["schedule.wait_for_model=0.9"], ["schedule.wait_for_model=0.9: must be above 1"]),
     (["env.miss_radius=0.5"], ["env.miss_radius=0.5", "more than 1.025 m"]),
     (["evaluation.start_noise=9"], ["evaluation.start_noise=9", "before the plane"]),
     (["env=dmc", "env.control_rate=25"], ["env.control_rate=25", "for races", "leave it at 50"]),
     (["env=dmc", "env.renderer=egl"], ["env.renderer=egl", "for races", "leave it at auto"]),
     (["env=dmc", "env.start_at_gate=0"], ["env.start_at_gate=0", "for races", "leave it at 0.5"]),
+    (
+        ["env=dmc", "schedule.discount.to=0.9", "schedule.discount.by=passes"],
+        ["schedule.discount.by=passes depends on gates", "env.suite=dmc has none"],
+    ),
     (["env=dmc", "schedule.start_on_line.to=0"], ["schedule.start_on_line is for races", "leave it out"]),
     (["env=dmc", "evaluation.start_noise=1"], ["evaluation.start_noise=1", "for races"]),
 ]
@@ -154,7 +143,7 @@ def test_more_minibatches_than_records_are_refused() -> None:
 )
 def test_what_would_be_ignored_is_refused(overrides: list[str], words: str) -> None:
     with pytest.raises(ValueError, match=words):
-        recipe_module("composing.checks").check_overrides(compose("dreamer_v3", *overrides), overrides)
+        recipe_module("composing.launching").check_overrides(compose("dreamer_v3", *overrides), overrides)
 
 
 @pytest.mark.parametrize(
@@ -177,7 +166,7 @@ def test_what_would_be_ignored_is_refused(overrides: list[str], words: str) -> N
 def test_settings_that_nothing_reads_are_refused(overrides: list[str], words: str) -> None:
     config = compose(taker(overrides), *overrides)
     with pytest.raises(ValueError, match=words):
-        recipe_module("composing.checks").check_read(config, overrides)
+        recipe_module("composing.launching").check_read(config, overrides)
 
 
 @pytest.mark.parametrize(
@@ -216,7 +205,7 @@ def test_settings_that_are_read_or_not_given_are_accepted(
     own = "from dreamer_racing.losses import State, reinforce as objective\n\n\nclass Mine(State):\n    pass\n"
     (tmp_path / "mine.py").write_text(own)
     monkeypatch.syspath_prepend(tmp_path)
-    recipe_module("composing.checks").check_read(compose(taker(overrides), *overrides), overrides)
+    recipe_module("composing.launching").check_read(compose(taker(overrides), *overrides), overrides)
 
 
 def test_deviations_that_fall_together_are_compared_by_their_clock() -> None:

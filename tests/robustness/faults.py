@@ -398,6 +398,8 @@ def difference(whole: Path, other: Path) -> str:
     rows, others = rows_of(whole), rows_of(other)
     if len(rows) != len(others):
         return f"metrics.csv has {len(others)} rows, not {len(rows)}"
+    if rows and [*rows[0]] != [*others[0]]:
+        return "metrics.csv: other columns, or in another order"
     columns = {column for row, own in zip(rows, others, strict=True) for column in row if row[column] != own[column]}
     return f"metrics.csv: {', '.join(sorted(columns))}" if columns else ""
 

@@ -1,4 +1,4 @@
-"""Saving and restoring a run, killed processes and signals."""
+"""Saving and restoring a run, killed processes and damaged files."""
 
 from __future__ import annotations
 
@@ -7,8 +7,6 @@ import os
 import random
 import shutil
 import signal
-import sys
-import threading
 import time
 from pathlib import Path
 
@@ -32,7 +30,6 @@ from dreamer_racing.training.checkpoint import (
 )
 from dreamer_racing.training.directory import ensure_writable, latest_checkpoint
 from dreamer_racing.training.publishing import CHECKSUMS, write_checksums
-from dreamer_racing.training.signals import GracefulExit
 from tests.forked import SERVER
 
 
@@ -331,43 +328,7 @@ def test_a_checkpoint_that_stepped_aside_comes_back(saved):
     assert latest_checkpoint(saved) == newest
 
 
-# --- signals ---
-
-
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-def test_first_signal_sets_the_flag_second_raises(number):
-    before = signal.getsignal(signal.SIGINT), signal.getsignal(signal.SIGTERM)
-    with GracefulExit() as stop:
-        assert not stop.requested
-        os.kill(os.getpid(), number)
-        assert stop.requested and stop.signal_name == number.name
-        with pytest.raises(KeyboardInterrupt):  # noqa: PT012 -- the signal may arrive a little later
-            os.kill(os.getpid(), signal.SIGINT)
-            time.sleep(1)
-    assert (signal.getsignal(signal.SIGINT), signal.getsignal(signal.SIGTERM)) == before
-
-
-def test_the_first_signal_is_answered_at_once(monkeypatch):
-    """Within 0.2 s, the best of some: what answers is the handler, not the loop that learns."""
-    reader, writer = os.pipe()
-    monkeypatch.setattr(sys, "__stderr__", os.fdopen(writer, "w"))
-    sent, answered = [], []
-
-    def send() -> None:
-        sent.append(time.monotonic())
-        os.kill(os.getpid(), signal.SIGINT)
-
-    for _ in range(5):
-        with GracefulExit("saving") as stop:
-            sender = threading.Timer(0.05, send)
-            sender.start()
-            while not stop.requested:  # as an update, which polls nothing
-                sum(range(1000))
-            assert os.read(reader, 100) == b"\nSIGINT: saving\n"
-            answered.append(time.monotonic())
-            sender.join()
-    seconds = [after - before for before, after in zip(sent, answered, strict=True)]
-    assert min(seconds) < 0.2
+# --- damage ---
 
 
 def flip(file: Path) -> None:
@@ -382,19 +343,20 @@ def files_of(checkpoint: Path) -> list[str]:
     return sorted(str(file.relative_to(checkpoint)) for file in checkpoint.rglob("*") if file.is_file())
 
 
-def test_every_damaged_file_is_noticed_and_the_checkpoint_before_it_is_taken(saved, caplog):
+def test_every_damaged_or_missing_file_is_noticed_and_the_checkpoint_before_it_is_taken(saved, caplog):
     newest, before = saved / "checkpoints/checkpoint-000000000030", saved / "checkpoints/checkpoint-000000000020"
     names = files_of(newest)
     assert len(names) > 8 and CHECKSUMS in names and any("replay" in name for name in names)
     for name in names:
         whole = (newest / name).read_bytes()
-        for damage in (flip, lambda file: file.write_bytes(file.read_bytes()[:-1])):
+        for damage in (flip, lambda file: file.write_bytes(file.read_bytes()[:-1]), Path.unlink):
             caplog.clear()
             damage(newest / name)
             with caplog.at_level("WARNING"):
                 assert newest_sound(saved) == before, name
-            if name != "manifest.json":  # without it there is no checkpoint, which is passed over as such
-                assert f"{newest} is damaged: {name}" in caplog.text and "later training is lost" in caplog.text
+            assert str(newest) in caplog.text and "is lost" in caplog.text, name
+            if damage is not Path.unlink and name != "manifest.json":  # else there is no complete checkpoint
+                assert f"{newest} is damaged: {name}" in caplog.text
             (newest / name).write_bytes(whole)
     assert newest_sound(saved) == newest
 
@@ -429,21 +391,8 @@ def test_a_file_that_is_no_state_is_refused_though_its_checksum_is_right(saved):
     assert "weights_only" not in str(error.value)
 
 
-def test_every_missing_file_is_noticed_and_the_checkpoint_before_it_is_taken(saved, caplog):
-    newest, before = saved / "checkpoints/checkpoint-000000000030", saved / "checkpoints/checkpoint-000000000020"
-    for name in files_of(newest):
-        caplog.clear()
-        whole = (newest / name).read_bytes()
-        (newest / name).unlink()
-        with caplog.at_level("WARNING"):
-            assert newest_sound(saved) == before, name
-        assert str(newest) in caplog.text and before.name in caplog.text and "is lost" in caplog.text, name
-        (newest / name).write_bytes(whole)
-    assert newest_sound(saved) == newest
-
-
 @pytest.mark.parametrize("name", ["manifest.json", CHECKSUMS])
-@pytest.mark.parametrize("content", ["[]", "null", "3", '"text"', "{}", "", "[" * 9], ids=repr)
+@pytest.mark.parametrize("content", ["[]", "3", "{}", "", "[" * 9], ids=repr)
 def test_json_of_another_kind_is_damage(saved, name, content, caplog):
     newest, before = saved / "checkpoints/checkpoint-000000000030", saved / "checkpoints/checkpoint-000000000020"
     whole = (newest / name).read_bytes()
@@ -502,17 +451,6 @@ def test_the_old_best_stays_until_the_new_one_is_there(tmp_path, monkeypatch):
     assert BestCheckpoint(tmp_path, {"counters": counters}, 1000).score == 2.0
 
 
-def test_a_signal_is_taken_where_nobody_reads_what_it_says(monkeypatch):
-    reader, writer = os.pipe()
-    os.close(reader)  # as after `| tee` has died of the same Ctrl-C
-    monkeypatch.setattr(sys, "__stderr__", os.fdopen(writer, "w"))
-    with GracefulExit("saving") as stop:
-        os.kill(os.getpid(), signal.SIGINT)
-        while not stop.requested:
-            time.sleep(0.001)
-    assert stop.signal_name == "SIGINT"
-
-
 def test_a_damaged_best_is_replaced_by_the_next_evaluation(tmp_path):
     counters = {"env_steps": 10}
     BestCheckpoint(tmp_path, {"counters": counters}, 1000).offer(5.0, 10)
@@ -520,13 +458,6 @@ def test_a_damaged_best_is_replaced_by_the_next_evaluation(tmp_path):
     again = BestCheckpoint(tmp_path, {"counters": counters}, 1000)
     assert again.score is None and again.offer(1.0, 20)
     assert BestCheckpoint(tmp_path, {"counters": counters}, 1000).score == 1.0
-
-
-def test_handlers_return_after_an_exception():
-    before = signal.getsignal(signal.SIGINT)
-    with pytest.raises(ZeroDivisionError), GracefulExit():
-        raise ZeroDivisionError
-    assert signal.getsignal(signal.SIGINT) is before
 
 
 def test_the_best_is_kept_and_only_the_best(tmp_path):

@@ -18,13 +18,6 @@ from dreamer_racing.training.directory import RunDirectory, RunLock, complete_ch
 from dreamer_racing.training.metrics import PendingMetrics
 
 
-def test_a_run_is_found_from_its_checkpoints_and_from_those_of_its_best(tmp_path: Path) -> None:
-    run = RunDirectory(tmp_path)
-    assert RunDirectory.of(run.checkpoints / "checkpoint-000000000100") == run
-    assert RunDirectory.of(run.best.checkpoints / "checkpoint-000000000100") == run.best
-    assert run.best.config == tmp_path / "best" / "config.yaml"
-
-
 def test_the_best_of_a_run_knows_the_run_and_a_run_that_is_called_best_is_its_own(tmp_path: Path) -> None:
     run = RunDirectory(tmp_path / "run")
     run.best.path.mkdir(parents=True)
@@ -34,7 +27,7 @@ def test_the_best_of_a_run_knows_the_run_and_a_run_that_is_called_best_is_its_ow
     assert run.evaluation_file == tmp_path / "run" / "evaluation" / "evaluation.json"
 
 
-def test_every_start_is_kept(tmp_path: Path) -> None:
+def test_every_start_is_kept(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     run = RunDirectory(tmp_path)
     assert run.read_starts() == []
     run.note_start(0, ["track=circle"], "abc")
@@ -43,8 +36,8 @@ def test_every_start_is_kept(tmp_path: Path) -> None:
     assert (first["env_steps"], first["overrides"], first["commit"]) == (0, ["track=circle"], "abc")
     assert (second["env_steps"], second["overrides"][-1], second["commit"]) == (4000, "loss.discount=0.98", None)
     with run.starts.open("a") as file:
-        file.write('{"env_steps": 80')  # killed there
-    assert len(run.read_starts()) == 2
+        file.write('{damaged}\n{"env_steps": 80')  # killed there
+    assert len(run.read_starts()) == 2 and caplog.text.count("is damaged") == 1
 
 
 def test_a_run_is_finished_where_it_says_so(tmp_path: Path) -> None:
@@ -82,15 +75,6 @@ def test_evaluations_after_the_resumed_env_steps_move(tmp_path: Path, caplog: py
     caplog.clear()
     run.set_aside_after(100)
     assert not caplog.text
-
-
-def test_a_damaged_line_of_the_history_is_left_out(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
-    run = RunDirectory(tmp_path)
-    run.note_start(0, [], None)
-    with run.starts.open("a") as file:
-        file.write("{damaged}\n")
-    run.note_start(8, [], None)
-    assert [start["env_steps"] for start in run.read_starts()] == [0, 8] and "is damaged" in caplog.text
 
 
 @pytest.mark.parametrize("call", ["fsync", "replace"])
@@ -195,24 +179,20 @@ def test_what_was_due_when_a_run_was_saved_is_due_when_it_goes_on() -> None:
     assert not journal.periods.due("log", 130) and journal.periods.due("save", 130)
 
 
-def test_minutes(monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize(
+    ("minutes", "first", "expected"),
+    [(0, 0, []), (10, 0, [10, 20]), (0, 2, [2]), (1, 2, list(range(1, 25))), (10, 2, [2, 12, 22])],
+)
+def test_the_first_time_of_an_interval_may_come_sooner(
+    minutes: float, first: float, expected: list[int], monkeypatch: pytest.MonkeyPatch
+) -> None:
     now = [0.0]
     monkeypatch.setattr("dreamer_racing.training.clock.time.monotonic", lambda: now[0])
-    interval, never = Interval(2.0), Interval(0.0)
-    for now[0], due in ((119.0, False), (120.0, True), (200.0, False), (245.0, True)):
-        assert interval.due() == due and not never.due()
-
-
-def test_the_first_time_of_an_interval_may_come_sooner(monkeypatch: pytest.MonkeyPatch) -> None:
-    now = [0.0]
-    monkeypatch.setattr("dreamer_racing.training.clock.time.monotonic", lambda: now[0])
-    intervals = {minutes: Interval(minutes, first=2.0) for minutes in (0.0, 1.0, 10.0)}
-    due: dict[float, list[int]] = {minutes: [] for minutes in intervals}
+    interval, due = Interval(minutes, first), []
     for minute in range(1, 25):
         now[0] = 60.0 * minute
-        for minutes, interval in intervals.items():
-            due[minutes] += [minute] if interval.due() else []
-    assert due == {0.0: [2], 1.0: list(range(1, 25)), 10.0: [2, 12, 22]}
+        due += [minute] if interval.due() else []
+    assert due == expected
 
 
 def test_a_first_one_comes_before_the_periods_once_and_costs_none_of_them():

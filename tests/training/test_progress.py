@@ -20,22 +20,18 @@ from dreamer_racing.training.progress import COLUMNS, LiveTable, Progress
 from dreamer_racing.training.signals import GracefulExit
 
 
-def test_waiting_takes_wall_clock_but_no_core():
+def test_waiting_takes_wall_clock_alone_and_computing_both():
     clock = RunClock({})
     before = clock.read()
     time.sleep(0.2)
-    after = clock.read()
-    assert after["wall_clock"] - before["wall_clock"] >= 0.2
-    assert 0.0 <= after["cpu_clock"] - before["cpu_clock"] < 0.1
-
-
-def test_computing_takes_both():
-    clock = RunClock({})
-    start = time.process_time()
+    waited, start = clock.read(), time.process_time()
     while time.process_time() - start < 0.05:
         pass
-    read = clock.read()
-    assert read["wall_clock"] >= 0.049 and 0.03 <= read["cpu_clock"] < read["wall_clock"] + 0.05  # read in 1/100 s
+    computed = clock.read()
+    assert waited["wall_clock"] - before["wall_clock"] >= 0.2
+    assert 0.0 <= waited["cpu_clock"] - before["cpu_clock"] < 0.1
+    assert computed["wall_clock"] - waited["wall_clock"] >= 0.049
+    assert computed["cpu_clock"] - waited["cpu_clock"] >= 0.03  # read in 1/100 s
 
 
 def test_a_continued_run_goes_on_where_it_was():
@@ -102,14 +98,6 @@ def test_a_log_shows_what_a_terminal_does(capsys: pytest.CaptureFixture[str]) ->
     ]
 
 
-def test_lines_keep_their_distance(capsys: pytest.CaptureFixture[str]) -> None:
-    progress = Progress(total=10, seconds=3600.0)
-    for step in range(10):
-        progress.advance(step, updates=0)
-        progress.show(METRICS)
-    assert capsys.readouterr().err == ""
-
-
 def test_what_is_not_saved_is_said(capsys: pytest.CaptureFixture[str]) -> None:
     Progress(total=10, seconds=0.0).show(METRICS, unsaved={"checkpoint": 5, "metrics": 1000})
     assert "NOT SAVED checkpoint since 5; metrics since 1,000" in capsys.readouterr().err
@@ -124,17 +112,16 @@ def test_a_log_that_takes_no_more_ends_nothing(monkeypatch: pytest.MonkeyPatch) 
         full.close()
 
 
-def test_of_several_processes_one_alone_speaks(capsys: pytest.CaptureFixture[str]) -> None:
-    with Progress(total=10, seconds=0.0, shown=False) as progress:
+def test_what_a_log_is_spared(capsys: pytest.CaptureFixture[str]) -> None:
+    with Progress(total=10, seconds=0.0, shown=False) as progress:  # of several processes one alone speaks
         progress.show(METRICS)
         progress.evaluating(12, 60)
         progress.write_line("evaluation")
-    assert capsys.readouterr() == ("", "")
-
-
-def test_a_log_has_no_use_for_how_far_an_evaluation_is(capsys: pytest.CaptureFixture[str]) -> None:
-    with Progress(total=100, seconds=0.0) as progress:
-        progress.evaluating(12, 60)
+    with Progress(total=10, seconds=3600.0) as progress:  # lines keep their distance, and evaluations have none
+        for step in range(10):
+            progress.advance(step, updates=0)
+            progress.show(METRICS)
+            progress.evaluating(12, 60)
     assert capsys.readouterr() == ("", "")
 
 

@@ -12,26 +12,23 @@ from tensordict import TensorDict
 from dreamer_racing.training.episodes import KNOWN_PASS_RATE, MEMORY, MIN_PROGRESS_RATE, GatePassRate
 from dreamer_racing.training.schedule import MEDIAN_WINDOW, PATIENCE, ModelLag, Ramp, RampClock, ReplayRatio
 
+HALF = {"to": 0.99, "begin": 0.5}
+
 
 @pytest.mark.parametrize(
-    ("progress", "expected"), [(0.0, 0.98), (0.5, 0.98), (0.6, 0.984), (0.75, 0.99), (1.0, 0.99), (1.3, 0.99)]
+    ("ramp", "progress", "expected"),
+    [
+        (Ramp(**HALF, end=0.75), 0.5, 0.98),
+        (Ramp(**HALF, end=0.75), 0.6, 0.984),
+        (Ramp(**HALF, end=0.75), 1.3, 0.99),
+        (Ramp(**HALF, end=0.5), 0.49, 0.98),
+        (Ramp(**HALF, end=0.5), 0.5, 0.99),
+        (Ramp(to=0.99, begin=0.2, end=0.4, by=RampClock.passes), 0.9, 0.985),
+        (Ramp(), 0.9, 0.98),
+    ],
 )
-def test_a_ramp_moves_between_its_shares_of_the_run(progress, expected):
-    assert Ramp(to=0.99, begin=0.5, end=0.75).at(0.98, {RampClock.run: progress}) == pytest.approx(expected)
-
-
-def test_a_ramp_to_nowhere_stays():
-    assert Ramp().at(0.7, {RampClock.run: 0.9}) == 0.7
-
-
-def test_a_ramp_may_go_by_another_clock():
-    ramp = Ramp(to=1.0, begin=0.2, end=0.4, by=RampClock.passes)
-    assert ramp.at(0.0, {RampClock.run: 0.9, RampClock.passes: 0.3}) == pytest.approx(0.5)
-
-
-def test_a_ramp_without_length_is_a_step():
-    ramp = Ramp(to=1.0, begin=0.5, end=0.5)
-    assert [ramp.at(0.0, {RampClock.run: progress}) for progress in (0.49, 0.5, 0.51)] == [0.0, 1.0, 1.0]
+def test_a_ramp_moves_between_two_times_of_its_clock(ramp, progress, expected):
+    assert ramp.at(0.98, {RampClock.run: progress, RampClock.passes: 0.3}) == pytest.approx(expected)
 
 
 @pytest.mark.parametrize(("begin", "end"), [(0.6, 0.5), (-0.1, 0.5), (0.5, 1.1)])
@@ -62,22 +59,21 @@ def resumed(*ratios: float, every: int = 1000) -> ReplayRatio:
     return ratio
 
 
-def test_another_ratio_counts_from_where_it_begins_whatever_was_due_before() -> None:
-    by_hand = int(900 * 4 / 64) + int(1000 * 8 / 64)
-    assert resumed(4.0, 8.0).updates(2000) == by_hand
-    assert resumed(4.0, 8.0, 1.0).updates(3000) == by_hand + int(1000 * 1 / 64)
-
-
-def test_the_same_ratio_goes_on_as_if_nothing_had_been() -> None:
-    assert [resumed(4.0, 4.0, 4.0).updates(steps) for steps in (0, 116, 5000)] == [0, 1, int(4900 * 4 / 64)]
-
-
-def test_what_another_ratio_asked_for_is_not_forgotten_by_going_on_twice() -> None:
-    assert resumed(4.0, 8.0, 8.0).updates(3000) == resumed(4.0, 8.0).updates(3000)
-
-
-def test_a_ratio_that_changes_within_the_prefill_begins_after_it() -> None:
-    assert resumed(4.0, 8.0, every=50).updates(180) == int(80 * 8 / 64)
+@pytest.mark.parametrize(
+    ("ratios", "every", "env_steps", "updates"),
+    [
+        ((4.0, 8.0), 1000, 2000, int(900 * 4 / 64) + int(1000 * 8 / 64)),
+        ((4.0, 8.0, 8.0), 1000, 3000, int(900 * 4 / 64) + int(2000 * 8 / 64)),
+        ((4.0, 8.0, 1.0), 1000, 3000, int(900 * 4 / 64) + int(1000 * 8 / 64) + int(1000 * 1 / 64)),
+        ((4.0, 4.0, 4.0), 1000, 116, 1),
+        ((4.0, 4.0, 4.0), 1000, 5000, int(4900 * 4 / 64)),
+        ((4.0, 8.0), 50, 180, int(80 * 8 / 64)),  # it changes within the prefill
+    ],
+)
+def test_another_ratio_counts_from_where_it_begins_whatever_was_due_before(
+    ratios: tuple[float, ...], every: int, env_steps: int, updates: int
+) -> None:
+    assert resumed(*ratios, every=every).updates(env_steps) == updates
 
 
 # The share of flights that pass the hardest gate, by hand.

@@ -7,6 +7,7 @@ import pty
 import signal
 import subprocess
 import sys
+import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from types import SimpleNamespace
@@ -194,12 +195,32 @@ def handlers() -> Iterator[None]:
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
-def test_each_is_a_request(number: signal.Signals) -> None:
+def test_the_first_is_a_request_which_the_handler_answers_and_the_second_an_interrupt(
+    number: signal.Signals, monkeypatch: pytest.MonkeyPatch
+) -> None:
     signal.signal(number, signal.SIG_DFL)
-    with GracefulExit() as stop:
+    reader, writer = os.pipe()
+    monkeypatch.setattr(sys, "__stderr__", os.fdopen(writer, "w"))
+    with GracefulExit("saving") as stop:
+        assert not stop.requested
         os.kill(os.getpid(), number)
+        assert os.read(reader, 100) == f"\n{number.name}: saving\n".encode(), "before the loop asks"
         assert stop.requested and stop.signal_name == number.name
+        if number != signal.SIGHUP:
+            with pytest.raises(KeyboardInterrupt):  # noqa: PT012 - the signal may arrive a little later
+                os.kill(os.getpid(), signal.SIGINT)
+                time.sleep(1)
     assert signal.getsignal(number) is signal.SIG_DFL
+    os.close(reader)
+
+
+def test_one_is_taken_where_nobody_reads_what_is_said(monkeypatch: pytest.MonkeyPatch) -> None:
+    reader, writer = os.pipe()
+    os.close(reader)  # as after `| tee` has died of the same Ctrl-C
+    monkeypatch.setattr(sys, "__stderr__", os.fdopen(writer, "w"))
+    with GracefulExit("saving") as stop:
+        os.kill(os.getpid(), signal.SIGINT)
+        assert stop.requested
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
