@@ -77,6 +77,8 @@ def why_not_writable(folder: Path) -> str:
         folder.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryFile(dir=folder) as file:
             file.write(b"writable")
+            file.flush()
+            os.fsync(file.fileno())
     except OSError as error:
         return error.strerror or str(error)
     return ""

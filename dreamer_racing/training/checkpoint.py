@@ -151,19 +151,13 @@ class RunCheckpoints:
         """Save this process's own parts into the checkpoint that rank 0 has begun."""
         _bind({**self._own, "random_state": RandomState()}).save(checkpoint / f"{PROCESS}{parallel.rank()}")
 
-    def load(
-        self,
-        path: str | Path | None = None,
-        map_location: torch.device | str = "cpu",
-        may_lack: Collection[str] = (),
-    ) -> dict[str, Any]:
+    def load(self, path: str | Path | None = None, may_lack: Collection[str] = ()) -> dict[str, Any]:
         """Restore all parts.
 
         If a checkpoint is damaged, the one before it is restored; what is lost is logged.
 
         Args:
             path: Run directory, folder of checkpoints, or one checkpoint; this run's latest if None.
-            map_location: Device that tensors are read to before the parts copy them to their own.
             may_lack: Parts that the checkpoint may lack; they are left as they are then.
 
         Returns:
@@ -176,7 +170,7 @@ class RunCheckpoints:
         self._last_saved = None
         parts = {**self.components, "random_state": RandomState()}
         if not self._own:
-            return load_components(self.directory if path is None else path, parts, map_location, may_lack)
+            return load_components(self.directory if path is None else path, parts, may_lack)
         looked_at = {*parts, *self._own_names}
         found = str(newest_sound(self.directory if path is None else path, looked_at)) if parallel.is_first() else ""
         source = Path(parallel.broadcast(found))
@@ -184,10 +178,10 @@ class RunCheckpoints:
         own = {name: part for name, part in parts.items() if name in self._own or name == "random_state"}
         same_number = (saved := metadata.get(PROCESSES, 1)) == parallel.num_processes()
         if same_number and parallel.is_first():
-            return _restore(source, parts, map_location, may_lack)
-        _restore(source, {name: part for name, part in parts.items() if name not in own}, map_location, may_lack)
+            return _restore(source, parts, may_lack)
+        _restore(source, {name: part for name, part in parts.items() if name not in own}, may_lack)
         if same_number:
-            _restore(source / f"{PROCESS}{parallel.rank()}", own, map_location)
+            _restore(source / f"{PROCESS}{parallel.rank()}", own)
         else:
             self._redistribute(source, saved)
         return metadata
@@ -272,17 +266,12 @@ class BestCheckpoint:
         return True
 
 
-def load_components(
-    path: str | Path,
-    components: Mapping[str, Any],
-    map_location: torch.device | str = "cpu",
-    may_lack: Collection[str] = (),
-) -> dict[str, Any]:
+def load_components(path: str | Path, components: Mapping[str, Any], may_lack: Collection[str] = ()) -> dict[str, Any]:
     """Restore some parts of a checkpoint, for example ``{"learner": learner}`` for an evaluation.
 
     Arguments, returned metadata and errors are those of `RunCheckpoints.load`.
     """
-    return _restore(newest_sound(path, components), components, map_location, may_lack)
+    return _restore(newest_sound(path, components), components, may_lack)
 
 
 def newest_sound(path: str | Path, parts: Collection[str] | None = None) -> Path:
@@ -310,9 +299,7 @@ def newest_sound(path: str | Path, parts: Collection[str] | None = None) -> Path
     raise RunCheckpointError(f"{'. '.join(damaged.values())}. It was not read; {advice}.")
 
 
-def load_state(
-    path: str | Path, part: str, map_location: torch.device | str = "cpu"
-) -> tuple[dict[str, Any], dict[str, Any]]:
+def load_state(path: str | Path, part: str) -> tuple[dict[str, Any], dict[str, Any]]:
     """Return the saved state of one part of a checkpoint, without an object to restore.
 
     Returns:
@@ -323,7 +310,7 @@ def load_state(
         RunCheckpointError: if it has no such part, or all are damaged.
     """
     state = _PlainState()
-    metadata = load_components(path, {part: state}, map_location)
+    metadata = load_components(path, {part: state})
     return dict(state.value), metadata
 
 
@@ -351,14 +338,12 @@ def _bind(components: Mapping[str, Any]) -> Checkpoint:
     return checkpoint
 
 
-def _restore(
-    source: Path, components: Mapping[str, Any], map_location: torch.device | str, may_lack: Collection[str] = ()
-) -> dict[str, Any]:
+def _restore(source: Path, components: Mapping[str, Any], may_lack: Collection[str] = ()) -> dict[str, Any]:
     """Restore some parts of a checkpoint, or of one process's folder in it, whose checksums were compared before."""
     lacking = set(may_lack) - Checkpoint.manifest(source)["components"].keys()
     there = {name: part for name, part in components.items() if name not in lacking}
     try:
-        return _bind(there).load(source, map_location=str(map_location)).manifest["metadata"]
+        return _bind(there).load(source, map_location="cpu").manifest["metadata"]
     except CheckpointError as error:
         # torch's own message advises to load the file without its safeguard
         reason = "One of its files does not contain a saved state." if "weights_only" in str(error) else error

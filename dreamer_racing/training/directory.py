@@ -7,7 +7,6 @@ import json
 import logging
 import os
 import socket
-import tempfile
 from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass
@@ -19,6 +18,7 @@ from typing import Any
 from torchrl.checkpoint import Checkpoint, CheckpointError
 
 from dreamer_racing import parallel
+from dreamer_racing.caches import why_not_writable
 from dreamer_racing.commands import from_here
 
 logger = logging.getLogger(__name__)
@@ -235,17 +235,11 @@ def ensure_writable(directory: str | Path, setting_name: str = "run_dir") -> Pat
         PermissionError: It is not; the message advises to choose another by ``setting_name``.
     """
     directory = Path(directory).expanduser().absolute()
-    try:
-        directory.mkdir(parents=True, exist_ok=True)
-        with tempfile.TemporaryFile(dir=directory) as file:
-            file.write(b"writable")
-            file.flush()
-            os.fsync(file.fileno())
-    except OSError as error:
+    if reason := why_not_writable(directory):
         raise PermissionError(
-            f"Cannot write to the folder {directory} ({error.strerror or error}): choose another with "
-            f"{setting_name}=PATH, or give this user write permission and free space."
-        ) from error
+            f"Cannot write to the folder {directory} ({reason}): choose another with {setting_name}=PATH, or give this "
+            "user write permission and free space."
+        )
     return directory
 
 

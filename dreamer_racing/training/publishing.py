@@ -26,35 +26,25 @@ CHECKSUMS = "checksums.json"
 
 def publish(partial: Path, final: Path) -> None:
     """Turn a folder with a checkpoint's files, written under another name, into the final checkpoint."""
-    _check_loadable(partial)
+    for file in partial.rglob(StateDictCheckpointAdapter.state_torch):  # so unreadable values are found now
+        torch.load(file, map_location="cpu", mmap=True, weights_only=True)
     write_checksums(partial)
     _sync_tree(partial)
-    _put_in_place(partial, final)
-
-
-def _check_loadable(path: Path) -> None:
-    """Read the state dicts back (memory-mapped), so that unreadable values are found now, not at a resume."""
-    for file in path.rglob(StateDictCheckpointAdapter.state_torch):
-        torch.load(file, map_location="cpu", mmap=True, weights_only=True)
+    aside = final.with_name(f".{final.name}{REPLACED}")
+    if final.exists():  # a folder cannot be replaced by a rename
+        os.replace(final, aside)
+    os.replace(partial, final)
+    shutil.rmtree(aside, ignore_errors=True)
+    _sync(final.parent)
 
 
 def _sync_tree(path: Path) -> None:
     for entry in (*path.rglob("*"), path):
-        descriptor = os.open(entry, os.O_RDONLY)
-        try:
-            os.fsync(descriptor)
-        finally:
-            os.close(descriptor)
+        _sync(entry)
 
 
-def _put_in_place(partial: Path, final: Path) -> None:
-    """Rename to the final name; an earlier folder of that name is renamed first, because it cannot be replaced."""
-    aside = final.with_name(f".{final.name}{REPLACED}")
-    if final.exists():
-        os.replace(final, aside)
-    os.replace(partial, final)
-    shutil.rmtree(aside, ignore_errors=True)
-    descriptor = os.open(final.parent, os.O_RDONLY)
+def _sync(path: Path) -> None:
+    descriptor = os.open(path, os.O_RDONLY)
     try:
         os.fsync(descriptor)
     finally:

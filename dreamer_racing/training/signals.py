@@ -10,13 +10,12 @@ import sys
 import threading
 from collections.abc import Callable
 from pathlib import Path
-from types import FrameType, TracebackType
+from types import FrameType
 from typing import Any
 
 from dreamer_racing.terminal import leave_terminal, say
 
-HANG_UP = getattr(signal, "SIGHUP", None)  # not on Windows
-ENDING = [number for number in (signal.SIGINT, signal.SIGTERM, HANG_UP) if number is not None]
+ENDING = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 
 
 class GracefulExit:
@@ -62,19 +61,17 @@ class GracefulExit:
                     self._previous[number] = signal.signal(number, self._handle)
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         for number, handler in self._previous.items():
             signal.signal(number, handler)
         self._previous.clear()
 
     def _handle(self, number: int, frame: FrameType | None) -> None:
         name = signal.Signals(number).name
-        if number == HANG_UP:
+        if number == signal.SIGHUP:
             leave_terminal()
         if self._arrived:
-            if HANG_UP in (number, self._arrived):
+            if signal.SIGHUP in (number, self._arrived):
                 return
             raise KeyboardInterrupt(number)
         self._arrived = number

@@ -163,10 +163,10 @@ def restore_learner(
     counters: dict[str, int] = {}
     parts = {"learner": learner, "counters": counters}
     if not isinstance(config, WorldModelRunConfig):
-        load_components(checkpoint, parts, map_location=device)
+        load_components(checkpoint, parts)
         return learner, counters
     schedule = Schedule(config.schedule, config.scheduled, config.total_env_steps)  # its gates come from the checkpoint
-    load_components(checkpoint, {**parts, "schedule": schedule}, map_location=device)
+    load_components(checkpoint, {**parts, "schedule": schedule})
     # Saved with the networks; the schedule of a run that was made longer would give other values.
     left_out = ("min_std", "max_std", "start_on_line")
     numbers = {name: value for name, value in schedule.at(counters["env_steps"]).items() if name not in left_out}

@@ -206,12 +206,6 @@ def test_the_track_of_a_file_is_noted_when_a_run_begins(track: Track, tmp_path: 
     assert (built_in.saved_track(), built_in.track_description) == (load_track("kidney"), None)
 
 
-def test_track_description_cannot_be_given() -> None:
-    launching = recipe_module("composing.launching")
-    with pytest.raises(ValueError, match=r"track_description= is set by the run from its track file"):
-        launching.check_overrides(compose("dreamer_v3"), ["track_description={}"])
-
-
 def write(track: Track, file: Path) -> None:
     """Write a track's file."""
     file.parent.mkdir(exist_ok=True)

@@ -139,6 +139,7 @@ def test_more_minibatches_than_records_are_refused() -> None:
         (["task=walker_walk"], "task=walker_walk is for the Control Suite: add env=dmc"),
         (["env=dmc", "track=circle"], "track=circle is for races"),
         (["env=dmc", "+decoys=paper"], "decoys=paper are for races"),
+        (["track_description=x"], "track_description= is set by the run from its track file"),
     ],
 )
 def test_what_would_be_ignored_is_refused(overrides: list[str], words: str) -> None:

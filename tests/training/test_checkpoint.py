@@ -31,6 +31,7 @@ from dreamer_racing.training.checkpoint import (
 from dreamer_racing.training.directory import ensure_writable, latest_checkpoint
 from dreamer_racing.training.publishing import CHECKSUMS, write_checksums
 from tests.forked import SERVER
+from tests.robustness.faults import turn
 
 
 class Run:
@@ -331,14 +332,6 @@ def test_a_checkpoint_that_stepped_aside_comes_back(saved):
 # --- damage ---
 
 
-def flip(file: Path) -> None:
-    """Change 16 bytes in the middle of a file."""
-    content = bytearray(file.read_bytes())
-    middle = len(content) // 2
-    content[middle : middle + 16] = bytes(255 - byte for byte in content[middle : middle + 16])
-    file.write_bytes(content)
-
-
 def files_of(checkpoint: Path) -> list[str]:
     return sorted(str(file.relative_to(checkpoint)) for file in checkpoint.rglob("*") if file.is_file())
 
@@ -349,7 +342,7 @@ def test_every_damaged_or_missing_file_is_noticed_and_the_checkpoint_before_it_i
     assert len(names) > 8 and CHECKSUMS in names and any("replay" in name for name in names)
     for name in names:
         whole = (newest / name).read_bytes()
-        for damage in (flip, lambda file: file.write_bytes(file.read_bytes()[:-1]), Path.unlink):
+        for damage in (turn, lambda file: file.write_bytes(file.read_bytes()[:-1]), Path.unlink):
             caplog.clear()
             damage(newest / name)
             with caplog.at_level("WARNING"):
@@ -362,7 +355,7 @@ def test_every_damaged_or_missing_file_is_noticed_and_the_checkpoint_before_it_i
 
 
 def test_a_run_goes_on_from_before_a_damaged_checkpoint_and_replaces_it(saved):
-    flip(next((saved / "checkpoints/checkpoint-000000000030").rglob("*-learner/*.pt")))
+    turn(next((saved / "checkpoints/checkpoint-000000000030").rglob("*-learner/*.pt")))
     run = Run(saved)
     assert run.checkpoints.load(saved)["env_steps"] == 20
     run.assert_consistent()
@@ -374,7 +367,7 @@ def test_a_run_goes_on_from_before_a_damaged_checkpoint_and_replaces_it(saved):
 
 def test_a_damaged_checkpoint_asked_for_is_refused_by_name(saved):
     newest = saved / "checkpoints/checkpoint-000000000030"
-    flip(next(newest.rglob("*-learner/*.pt")))
+    turn(next(newest.rglob("*-learner/*.pt")))
     with pytest.raises(
         RunCheckpointError, match=r"30 is damaged: .*-learner/.*\.pt does not match .* checkpoint-000000000020"
     ):
@@ -454,7 +447,7 @@ def test_the_old_best_stays_until_the_new_one_is_there(tmp_path, monkeypatch):
 def test_a_damaged_best_is_replaced_by_the_next_evaluation(tmp_path):
     counters = {"env_steps": 10}
     BestCheckpoint(tmp_path, {"counters": counters}, 1000).offer(5.0, 10)
-    flip(next((tmp_path / "best").rglob("value.json")))
+    turn(next((tmp_path / "best").rglob("value.json")))
     again = BestCheckpoint(tmp_path, {"counters": counters}, 1000)
     assert again.score is None and again.offer(1.0, 20)
     assert BestCheckpoint(tmp_path, {"counters": counters}, 1000).score == 1.0
