@@ -359,8 +359,10 @@ class Session:
                 self.evaluator.close()
             if self.metrics is not None:
                 self.metrics.close()
-        if self._lock is not None:
-            self._lock.release() if self.parts else self._lock.abandon()
+        if self._lock is not None and self.parts:
+            self._lock.release()
+        elif self._lock is not None:
+            self._lock.abandon()
 
     def _begin(self) -> None:
         """Start to handle signals and to show progress."""
