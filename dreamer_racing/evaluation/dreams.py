@@ -151,5 +151,5 @@ def record_dream(learner: WorldModelLearner, trajectory: Trajectory, painter: Pa
     imagined = dream(learner, trajectory, painter, part, seen)
     imagined[:seen] = reconstructed[:seen]  # the same sample of the latents in both
     frame_dt, from_pose = STRIDE * trajectory.control_dt, isinstance(painter, BelievedView)
-    stored = [images[None, ::STRIDE].numpy() for images in (pixels[part], reconstructed, imagined)]
-    return Dream(*stored, context=SEEN_FRAMES, frame_dt=frame_dt, from_pose=from_pose)
+    real, observed, predicted = (images[None, ::STRIDE].numpy() for images in (pixels[part], reconstructed, imagined))
+    return Dream(real, observed, predicted, SEEN_FRAMES, frame_dt, from_pose)

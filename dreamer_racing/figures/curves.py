@@ -10,7 +10,6 @@ import math
 from collections import defaultdict
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
 from typing import NamedTuple
 
@@ -275,7 +274,7 @@ def _deviation_band(strata: Sequence[np.ndarray]) -> np.ndarray:
 
 
 AGGREGATES: dict[str, tuple[Callable[..., np.ndarray], Callable[..., np.ndarray]]] = {
-    "mean": (partial(np.mean, axis=0), _deviation_band),
+    "mean": (lambda runs: runs.mean(0), _deviation_band),
     "iqm": (interquartile_mean, bootstrap_interval),
 }
 """Functions for the centre, from runs (S, P), and for the band (2, P), from runs by track."""
