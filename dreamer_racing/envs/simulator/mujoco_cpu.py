@@ -169,6 +169,12 @@ class MujocoSimulator(Simulator):
         num_threads: physics and rendering threads; `usable_threads` if None.
         generator: source of the randomisation of physics and looks.
         looks: randomisation of looks; None for the same in every episode.
+
+    Example:
+        >>> from dreamer_racing.envs.tracks import load_track
+        >>> simulator = MujocoSimulator(load_track("kidney"), QuadrotorParameters(), num_envs=4, renderer=None)
+        >>> simulator.step(torch.zeros(4, 4)).shape
+        torch.Size([11, 4, 3])
     """
 
     def __init__(
