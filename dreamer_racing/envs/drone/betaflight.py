@@ -48,6 +48,10 @@ class BetaflightParameters:
 
     Raises:
         ValueError: the message gives the value, and what is allowed.
+
+    Example:
+        >>> BetaflightParameters(p=(50, 52, 30)).p
+        (50, 52, 30)
     """
 
     p: tuple[float, float, float] = (45.0, 47.0, 30.0)  # [doc]; yaw [set], as it oscillates with its default, 45

@@ -81,6 +81,13 @@ class GateSweeper:
 
     Raises:
         ValueError: the miss radius is within the frame.
+
+    Example:
+        >>> from dreamer_racing.envs.tracks import load_track
+        >>> sweeper = GateSweeper(load_track("circle"))
+        >>> path = torch.tensor([[4.0, -0.1, 1.35], [4.0, 0.1, 1.35]]).unsqueeze(1)  # (P + 1, N, 3)
+        >>> sweeper(path, torch.tensor([0])).passes
+        tensor([1])
     """
 
     def __init__(

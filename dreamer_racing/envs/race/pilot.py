@@ -50,6 +50,12 @@ class ScriptedPilot:
         parameters: preset or parameters of the drone; the pilot uses only the nominal ones, without randomisation.
         limits: limits of the line; its `speed` sets the aggressiveness. None for the defaults.
         gains: the feedback gains; None for the defaults.
+
+    Example:
+        >>> pilot = ScriptedPilot("circle")
+        >>> level, still = torch.tensor([[1.0, 0.0, 0.0, 0.0]]), torch.zeros(1, 3)
+        >>> pilot.act(torch.tensor([[4.0, -2.5, 1.35]]), level, still, still, torch.tensor([0])).shape
+        torch.Size([1, 4])
     """
 
     WINDOW = 0.25  # s: the line is searched from this long before the last gate to this long after the target gate

@@ -272,6 +272,13 @@ class RaceVector:
     """Computes the race vector of N drones, with the entries listed in ``RACE_VECTOR_ENTRIES``.
 
     Every entry is of order one [choice of divisors]. ``dtype`` is the floating-point type of the drones' state.
+
+    Example:
+        >>> from dreamer_racing.envs.worlds import RaceWorlds
+        >>> worlds = RaceWorlds("circle", num_envs=2, from_pixels=False)
+        >>> worlds.reset()
+        >>> worlds.vector().shape
+        torch.Size([2, 21])
     """
 
     def __init__(self, track: Track, device: torch.device | str = "cpu", dtype: torch.dtype = torch.float64) -> None:

@@ -59,6 +59,12 @@ class StartSampler:
     Raises:
         ValueError: a share is none, there is no line, or ``start_noise`` is negative or could carry a drone across the
             plane of its first gate.
+
+    Example:
+        >>> from dreamer_racing.envs.tracks import load_track
+        >>> pose = StartSampler(load_track("circle")).sample(2, evaluation=True)
+        >>> pose.position[0]
+        tensor([ 4.0000, -2.5000,  1.3500])
     """
 
     POSITION_NOISE = (0.5, 0.5, 0.3)  # m

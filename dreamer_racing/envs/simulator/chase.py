@@ -36,6 +36,14 @@ class ChaseView:
 
     Raises:
         RendererUnavailableError: neither EGL nor OSMesa works here; the message says why and how to fix it.
+
+    Example:
+        >>> from dreamer_racing.envs.tracks import load_track
+        >>> view = ChaseView(load_track("circle"), QuadrotorParameters())
+        >>> above_the_start = np.array([[4.0, -2.5, 1.35]])
+        >>> view.draw(above_the_start, np.array([[1.0, 0, 0, 0]]), np.array([0]), np.array([0.0])).shape
+        (1, 256, 256, 3)
+        >>> view.close()
     """
 
     def __init__(self, track: Track, parameters: QuadrotorParameters, num_envs: int = 1, size: int = 256) -> None:

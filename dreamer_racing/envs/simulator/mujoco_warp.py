@@ -31,6 +31,12 @@ class WarpSimulator(Simulator):
 
     Raises:
         ValueError: the device does not have enough memory for so many worlds.
+
+    Example:
+        >>> from dreamer_racing.envs.tracks import load_track
+        >>> simulator = WarpSimulator(load_track("kidney"), QuadrotorParameters(), 4, images=False, device="cpu")
+        >>> simulator.step(torch.zeros(4, 4)).shape
+        torch.Size([11, 4, 3])
     """
 
     def __init__(
