@@ -82,6 +82,13 @@ def test_an_agent_step_is_two_simulator_steps_with_their_rewards_summed(task: st
             assert torch.equal(after["vector"][row], flat(second.observation))
 
 
+@pytest.mark.parametrize("repeat", [1, 2, 5])
+def test_action_repeat_advances_simulated_time(repeat: int) -> None:
+    env = blind(num_envs=1, action_repeat=repeat)
+    env.rollout(4)
+    assert env.worlds[0].env.physics.time() == pytest.approx(4 * repeat * 0.01)
+
+
 def test_time_limit_truncates_after_500_agent_steps_and_never_terminates() -> None:
     env = blind(num_envs=2)
     after = env.rollout(600)["next"]

@@ -27,16 +27,26 @@ from dreamer_racing.envs.tracks import Track, load_track
 class PilotGains:
     """Feedback gains and limits of the pilot."""
 
-    position: float = 14.0  # 1/s², acceleration per metre of lateral error
-    velocity: float = 6.0  # 1/s, acceleration per m/s of lateral velocity error
-    progress: float = 3.0  # 1/s, gain of the speed error along the line
-    attitude: float = 120.0  # 1/s², angular acceleration per radian of thrust axis error
-    body_rate: float = 17.0  # 1/s, angular acceleration per rad/s of rate error
-    yaw: float = 5.0  # 1/s, yaw rate per radian of heading error
-    correction_max: float = 10.0  # m/s², maximum acceleration from lateral errors
-    progress_max: float = 8.0  # m/s², maximum acceleration from speed errors along the line
-    look_ahead: float = 0.5  # s, the nose points to the line's position this much later
-    adaptation: float = 1.0  # 1/s, rate at which the thrust scale estimate follows the measurement
+    position: float = 14.0
+    """Acceleration per metre of lateral error, 1/s²."""
+    velocity: float = 6.0
+    """Acceleration per m/s of lateral velocity error, 1/s."""
+    progress: float = 3.0
+    """Gain of the speed error along the line, 1/s."""
+    attitude: float = 120.0
+    """Angular acceleration per radian of thrust axis error, 1/s²."""
+    body_rate: float = 17.0
+    """Angular acceleration per rad/s of rate error, 1/s."""
+    yaw: float = 5.0
+    """Yaw rate per radian of heading error, 1/s."""
+    correction_max: float = 10.0
+    """Maximum acceleration from lateral errors, m/s²."""
+    progress_max: float = 8.0
+    """Maximum acceleration from speed errors along the line, m/s²."""
+    look_ahead: float = 0.5
+    """The nose points to the line's position this much later, s."""
+    adaptation: float = 1.0
+    """Rate at which the thrust scale estimate follows the measurement, 1/s."""
 
 
 class ScriptedPilot:

@@ -113,15 +113,24 @@ class GateShape:
 class Track:
     """A race track. Read one with ``load_track`` or build one with ``make_track``."""
 
-    name: str  # short name, for logs and plots
-    gates: tuple[Gate, ...]  # race gates in the order of flight
-    decoys: tuple[Gate, ...]  # gates that are only rendered
-    shape: GateShape  # dimensions of every gate
-    start_position: Vector  # position of the start pose, m
-    start_yaw_degrees: float  # heading of the start pose
-    bounds_low: Vector  # lower corner of the box that a drone must not leave, m
-    bounds_high: Vector  # upper corner of the same box, m
-    laps: int = 3  # number of laps of an evaluation episode
+    name: str
+    """Short name, for logs and plots."""
+    gates: tuple[Gate, ...]
+    """Race gates in the order of flight."""
+    decoys: tuple[Gate, ...]
+    """Gates that are only rendered."""
+    shape: GateShape
+    """Dimensions of every gate."""
+    start_position: Vector
+    """Position of the start pose, m."""
+    start_yaw_degrees: float
+    """Heading of the start pose, degrees from world x, positive to the left."""
+    bounds_low: Vector
+    """Lower corner of the box that a drone must not leave, m."""
+    bounds_high: Vector
+    """Upper corner of the same box, m."""
+    laps: int = 3
+    """Number of laps of an evaluation episode."""
 
     def __post_init__(self) -> None:
         _normalise(self, ("start_yaw_degrees",), ("start_position", "bounds_low", "bounds_high"))

@@ -141,6 +141,10 @@ def test_progress_is_the_decrease_of_the_distance(previous, position, progress):
     assert reward(previous, position) == (pytest.approx(progress), pytest.approx(3.0))
 
 
+def test_a_pass_replaces_progress_and_the_rate_term():
+    assert reward((9.9, 0.0, 0.0), (10.1, 0.0, 0.0), passes=1) == (10.0, 0.0)
+
+
 @pytest.mark.parametrize("passes", [0, 1])
 def test_a_crash_outweighs_everything(passes):
     assert reward((9.9, 0.0, 0.0), (10.1, 0.0, 0.0), passes=passes, crashed=True) == (-4.0, 0.0)
@@ -158,6 +162,20 @@ def test_weights():
     assert reward(*flight, weights=weights) == (pytest.approx(0.4), pytest.approx(3.0))
     assert reward(*flight, weights=weights, passes=1) == (7.0, 0.0)
     assert reward(*flight, weights=weights, crashed=True) == (-1.0, 0.0)
+
+
+def test_drones_are_independent():
+    base, rate = race_reward(
+        RewardWeights(),
+        GATE.expand(3, 3),
+        torch.zeros(3, 3),
+        torch.tensor([[1.0, 0.0, 0.0], [2.0, 0.0, 0.0], [math.nan, 0.0, 0.0]]),
+        RATES.expand(3, 3),
+        torch.tensor([False, True, False]),
+        torch.tensor([False, False, True]),
+    )
+    assert base.tolist() == [1.0, 10.0, -4.0]
+    assert rate.tolist() == [3.0, 0.0, 0.0]
 
 
 @pytest.mark.parametrize("track", ["kidney", "figure8", "split_s", "circle"])

@@ -95,6 +95,13 @@ def test_a_pass_pays_ten_and_moves_the_target_on():
 # ---------------------------------------------------------------- laps and time
 
 
+def test_flying_round_a_gate_is_not_the_end():
+    race = begin()
+    beside = torch.tensor([2.0, 0.0, 0.0], dtype=torch.float64)
+    outcome = fly(race, *(point + beside for point in through(0)))
+    assert (outcome.target_gate.item(), outcome.gates_passed.item(), outcome.terminated.item()) == (0, 0, False)
+
+
 def test_lap_times():
     race = begin()
     hover(race, 5)
@@ -123,6 +130,13 @@ def test_the_last_lap_truncates_as_finished(laps):
         assert outcome.finished.item() == outcome.truncated.item() == (passes == 12 and laps == 3)
         assert not outcome.terminated.item()
     assert outcome.reward_base.item() == 10.0
+
+
+def test_without_laps_an_episode_never_finishes():
+    race = begin()
+    for passes in range(20):
+        outcome = fly(race, *through(passes % 4))
+        assert not (outcome.finished | outcome.truncated).item()
 
 
 def test_time_limit_truncates():
