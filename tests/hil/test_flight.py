@@ -166,6 +166,13 @@ def test_the_battery_is_heard_in_flight_reckoned_with_and_played_back(tmp_path):
     assert first_difference(chain(), ticks).startswith("tick 7: voltage was "), "bit for bit"
 
 
+def test_nothing_is_armed_without_leave():
+    plant = Watched(CIRCLE)
+    ended = plant.fly(chain_of(Hover(), plant, arm=False), Hover.rate, 2.0)
+    assert ended.startswith("2 s are over; not armed:") and "arm=true" in ended
+    assert not any(command.armed for _, command in plant.sent)
+
+
 @pytest.mark.parametrize("phase", [0.005, 0.035])
 def test_poses_are_lost_to_cut_within_200_ms_at_25_hz_by_an_actor_that_takes_30_ms(phase):
     """Whenever in a tick the last one was measured; what is cut does not wait for the actor."""
