@@ -28,6 +28,7 @@ import torch
 from measuring import make_parser, report
 from torch import Tensor
 
+from dreamer_racing.envs.drone.betaflight import P_SCALE, full_stick
 from dreamer_racing.envs.drone.parameters import PRESETS, ROTOR_SPINS, QuadrotorParameters
 from dreamer_racing.envs.drone.rate_loop import RateLoop, Row
 
@@ -147,7 +148,8 @@ def setpoints(channels: Tensor, drone: QuadrotorParameters, loop: RateLoop) -> T
     share = ((channels[..., 2:3] - p.min_check) / (2000.0 - p.min_check)).clamp(0.0, 1.0)
     thrust = 4.0 * drone.rotor_thrust_max * (p.motor_idle + (1.0 - p.motor_idle) * share).square()
     sticks = (channels[..., [0, 1, 3]] - 1500.0) / 500.0 * torch.tensor([1.0, 1.0, -1.0])
-    return torch.cat((thrust, torch.deg2rad(sticks * loop.full_stick)), dim=-1)
+    full_sticks = torch.tensor([full_stick(rate) for rate in drone.body_rate_max])  # (3,) deg/s
+    return torch.cat((thrust, torch.deg2rad(sticks * full_sticks)), dim=-1)
 
 
 def fly(flights: Flights, drone: QuadrotorParameters = DRONE, led: Tensor | None = None) -> tuple[Tensor, Tensor]:
@@ -192,8 +194,8 @@ def fly(flights: Flights, drone: QuadrotorParameters = DRONE, led: Tensor | None
 
 def _yaw_integral(motors: Tensor, rates: Tensor, loop: RateLoop) -> Tensor:
     """Return the yaw integral (N,): the yaw correction in the motor commands minus its P term."""
-    total = 250.0 / (1.0 - loop.parameters.motor_idle) * (motors @ loop.mix[2])
-    return total - loop.p[2] * (loop.state[:, Row.SETPOINT, 2] - torch.rad2deg(rates[:, 2]))
+    total = 250.0 / (1.0 - loop.parameters.motor_idle) * (motors @ torch.tensor(ROTOR_SPINS, dtype=torch.float64))
+    return total - P_SCALE * loop.parameters.p[2] * (loop.state[:, Row.SETPOINT, 2] - torch.rad2deg(rates[:, 2]))
 
 
 def compare(flights: Flights, drone: QuadrotorParameters = DRONE, kinds: Sequence[str] = KINDS) -> list[dict[str, Any]]:

@@ -8,8 +8,10 @@ from __future__ import annotations
 import struct
 
 import numpy as np
+import torch
 
-from tests.rate_controller import RateController
+from dreamer_racing.envs.drone.parameters import PRESETS
+from dreamer_racing.envs.drone.rate_loop import RateLoop
 
 IDLE = 0.055  # of the motors, armed
 MIN_CHECK = 1050  # µs: arms below, and the throttle begins there
@@ -35,7 +37,7 @@ class Firmware:
         self.time, self.refused = 0.0, 0
         self._heard: float | None = None  # when the radio last spoke; None: never, or not since it was lost
         self._may_arm = self._was_armed = False
-        self._controller = RateController()
+        self._loop = RateLoop(PRESETS["betaflight"], 1)
 
     def hear(self, data: bytes) -> None:
         """Read a packet of the radio: f64 stamp, 16 u16 µs in the order AETR, then AUX1."""
@@ -67,11 +69,12 @@ class Firmware:
     def motors(self) -> np.ndarray:
         """M1 … M4: rear right, front right, rear left, front left."""
         if self.armed and not self._was_armed:
-            self._controller.reset()
+            self._loop.reset(torch.ones(1, 1, dtype=torch.bool))
         self._was_armed = self.armed
         if not self.armed:
             return np.zeros(4)
-        return self._controller.motors(self._controller.thrust_max * self.throttle**2, self.rates, self.gyro)
+        setpoint = np.append(self._loop.thrust_max * self.throttle**2, self.rates)
+        return self._loop.motor_commands(torch.from_numpy(setpoint[None]), torch.from_numpy(self.gyro[None]))[0].numpy()
 
     def pack(self, motors: np.ndarray) -> bytes:
         """Return the packet of four motors, in this version's order."""

@@ -1,8 +1,8 @@
-"""Betaflight's rate loop, from setpoints to motor commands, for N drones at once.
+"""Betaflight's rate loop, from setpoints to motor commands, for N drones at once, as a warp function.
 
 Channels are held and quantised; P, I and D act on the filtered gyro; the mixer first scales the correction to the
-motors' range and then moves the throttle so that it fits (air mode). This is the torch reference of the kernel
-`simulator.fused_rate_loop`. The numbers and their sources: `drone.betaflight`.
+motors' range and then moves the throttle so that it fits (air mode). `simulator.fused_flight` calls it in every physics
+step; `tests/torch_flight.py` states the same in torch. The numbers and their sources: `drone.betaflight`.
 
 Not modelled, because they are switched off or without effect in the recording: feedforward (off), RC smoothing (off),
 dynamic notches and RPM filters (no noise to filter), thrust linearisation and throttle boost (off).
@@ -10,15 +10,23 @@ dynamic notches and RPM filters (no noise to filter), thrust linearisation and t
 Shapes: N drones; three axes are roll, pitch and yaw, FLU: +x right, +y nose down, +z left. Computes in deg/s.
 """
 
+# warp evaluates annotations, which mypy does not accept as types: no `from __future__ import annotations` here
+# mypy: disable-error-code="valid-type,index,no-untyped-def,operator"
+
 import enum
 import math
+from functools import cache, cached_property
+from typing import Any
 
 import torch
 from torch import Tensor
 
 from dreamer_racing.envs.drone import betaflight
-from dreamer_racing.envs.drone.betaflight import BetaflightParameters, full_stick
+from dreamer_racing.envs.drone.betaflight import full_stick
 from dreamer_racing.envs.drone.parameters import GRAVITY, QuadrotorParameters
+from dreamer_racing.envs.simulator.warp_device import load_warp
+
+DEGREES = 57.29577951308232  # per radian
 
 
 class Row(enum.IntEnum):
@@ -50,109 +58,44 @@ class DroneParameter(enum.IntEnum):
     MOTORS = 4  # decay in a physics step, in half a step, share of thrust lost to battery sag at full load
 
 
-MIX = ((-1.0, -1.0, 1.0, 1.0), (1.0, -1.0, 1.0, -1.0), (1.0, -1.0, -1.0, 1.0))
-"""Mixer coefficients of roll, pitch and yaw by rotor: Betaflight's QUADX, yaw in FLU."""
-
-
-def lowpass_gain(cutoff: Tensor | float, dt: float) -> Tensor | float:
-    """Return the gain of a first-order low-pass in a step of ``dt``, as in Betaflight's PT1."""
-    omega = 2.0 * math.pi * dt * cutoff
-    return omega / (omega + 1.0)
-
-
-def dynamic_cutoff(ends: tuple[float, float], expo: float, throttle: Tensor) -> Tensor:
-    """Return the cut-off in Hz at a throttle in [0, 1]."""
-    return ends[0] + (ends[1] - ends[0]) * throttle * (1.0 + (1.0 - throttle) * expo)
-
-
 class RateLoop:
     """Rate loops of N Betaflight flight controllers.
 
     Args:
-        parameters: the drone, whose `betaflight` is set.
+        drone: the drone, whose `betaflight` is set.
 
     Attributes:
         state: (N, rows of `Row`, 3) their state, updated in place.
         drone_parameters: (N, rows of `DroneParameter`, 3) their individual parameters, updated in place.
+        frame_steps: physics steps from one frame of the link to the next.
+        thrust_max: thrust at full command, N.
     """
 
     def __init__(
         self,
-        parameters: QuadrotorParameters,
+        drone: QuadrotorParameters,
         num_drones: int,
         device: torch.device | str = "cpu",
         dtype: torch.dtype = torch.float64,
     ) -> None:
-        assert parameters.betaflight is not None
-        self.parameters: BetaflightParameters = parameters.betaflight
-        self.dt = parameters.physics_dt
-        self.frame_steps = max(1, round(1.0 / (self.parameters.link_rate * self.dt)))
-
-        def tensor(values: object) -> Tensor:
-            return torch.tensor(values, device=device, dtype=dtype)
-
-        p = self.parameters
-        self.thrust_max = 4.0 * parameters.rotor_thrust_max  # N, at full command
-        self.full_stick = tensor([full_stick(rate) for rate in parameters.body_rate_max])  # (3,) deg/s
-        self.p = tensor(p.p) * betaflight.P_SCALE
-        self.i = tensor(p.i) * betaflight.I_SCALE * tensor((1.0, 1.0, betaflight.YAW_I_SCALE))
-        self.d = tensor(p.d) * betaflight.D_SCALE
-        pairs = zip(p.d, p.d_max, strict=True)
-        self.d_rise = tensor([max(high / low - 1.0, 0.0) if low else 0.0 for low, high in pairs])  # (3,) at most
-        self.sum_limit = tensor(p.sum_limit)
-        self.p_gain = tensor((1.0, 1.0, lowpass_gain(p.yaw_lowpass, self.dt)))  # of P's low-pass: yaw only
-        self.level = tensor((1.0, 1.0, 0.0))  # axes with I-term relax and anti-gravity
-        self.mix = tensor(MIX)  # (3, 4)
+        assert drone.betaflight is not None
+        self._drone, self.parameters = drone, drone.betaflight
+        self.frame_steps = max(1, round(1.0 / (self.parameters.link_rate * drone.physics_dt)))
+        self.thrust_max = 4.0 * drone.rotor_thrust_max
         self.state = torch.zeros(num_drones, len(Row), 3, device=device, dtype=dtype)
         self.drone_parameters = torch.ones(num_drones, len(DroneParameter), 3, device=device, dtype=dtype)
-        self.hover_throttle = self._throttle(tensor([parameters.mass * GRAVITY])).item()
+        p, way = self.parameters, 2000.0 - self.parameters.min_check
+        motor = (self.state.new_tensor(drone.mass * GRAVITY) / self.thrust_max).clamp(0.0, 1.0).sqrt()
+        share = (motor - p.motor_idle) / (1.0 - p.motor_idle)
+        self._hover_throttle = ((share * way + 0.5).floor() / way).clamp(0.0, 1.0).item()  # sent in whole µs
         self.reset(torch.ones(num_drones, 1, dtype=torch.bool, device=device))
 
     def reset(self, rows: Tensor, phase: Tensor | float = 0.0) -> None:
-        """Reset the state of the masked drones to that in hover.
-
-        Args:
-            rows: mask of the drones, (N, 1) bool.
-            phase: (N,) physics steps until the link's next frame.
-        """
+        """Reset the state of the masked drones (N, 1) bool to that in hover, `phase` (N,) steps before a frame."""
         fresh = torch.zeros_like(self.state)
-        fresh[:, Row.THROTTLE, :2] = self.hover_throttle
+        fresh[:, Row.THROTTLE, :2] = self._hover_throttle
         fresh[:, Row.THROTTLE, 2] = phase
         self.state.copy_(torch.where(rows.unsqueeze(-1), fresh, self.state))
-
-    def _throttle(self, thrust: Tensor) -> Tensor:
-        """Return the firmware's throttle in [0, 1] for a thrust in N, sent over a channel in whole µs."""
-        p = self.parameters
-        motor = (thrust / self.thrust_max).clamp(0.0, 1.0).sqrt()
-        share = (motor - p.motor_idle) / (1.0 - p.motor_idle)
-        way = 2000.0 - p.min_check
-        return ((share * way + 0.5).floor() / way).clamp(0.0, 1.0)
-
-    def receive(self, setpoint: Tensor) -> None:
-        """Update the channels of the drones for which a link frame is due.
-
-        Args:
-            setpoint: (N, 4) collective thrust in N, body rates in rad/s.
-        """
-        p, state = self.parameters, self.state
-        due = state[:, Row.THROTTLE, 2:] <= 0.0  # (N, 1)
-        stick = (torch.rad2deg(setpoint[:, 1:]) / self.full_stick).clamp(-1.0, 1.0)
-        wanted = (500.0 * stick + 0.5).floor() / 500.0 * self.full_stick  # whole µs
-        speed = (wanted - state[:, Row.SETPOINT]) * p.link_rate
-        interval = 1.0 / p.link_rate
-        before = state[:, Row.SETPOINT_SPEED]
-        smooth = torch.lerp(before, speed, interval / (interval + p.setpoint_smoothing))
-        new = {
-            Row.SETPOINT: wanted,
-            Row.SETPOINT_MEAN: 0.5 * (before + smooth),
-            Row.SETPOINT_SPEED: smooth,
-        }
-        for row, value in new.items():
-            state[:, row] = torch.where(due, value, state[:, row])
-        throttle = self._throttle(setpoint[:, :1])
-        state[:, Row.THROTTLE, :1] = torch.where(due, throttle, state[:, Row.THROTTLE, :1])
-        left = torch.where(due, float(self.frame_steps), state[:, Row.THROTTLE, 2:])
-        state[:, Row.THROTTLE, 2:] = left - 1.0
 
     def motor_commands(self, setpoint: Tensor, body_rates: Tensor) -> Tensor:
         """Advance by one physics step; return the motor commands (N, 4) in [idle, 1].
@@ -161,70 +104,260 @@ class RateLoop:
             setpoint: (N, 4) collective thrust in N and body rates in rad/s at the link's receiver.
             body_rates: (N, 3) rad/s, the gyro measurement.
         """
-        self.receive(setpoint.to(self.state))
-        throttle = self.state[:, Row.THROTTLE, :1]
-        correction = self._correct(torch.rad2deg(body_rates.to(self.state)), throttle)
-        self._update_anti_gravity(throttle)
-        return self._mix(correction / 1000.0, throttle)
+        (given_setpoint, given_rates, commands), launch = self._advance
+        given_setpoint.copy_(setpoint)
+        given_rates.copy_(body_rates)
+        launch.launch()
+        return commands.clone()
 
-    def _lowpass(self, row: Row, value: Tensor, gain: Tensor | float) -> Tensor:
-        """Low-pass a value (N, 3) into a row of the state; return the filtered value."""
-        moved = self.state[:, row] + gain * (value - self.state[:, row])
-        self.state[:, row] = moved
-        return moved
+    @cached_property
+    def _advance(self) -> tuple[list[Tensor], Any]:
+        """The kernel's setpoints (N, 4), body rates (N, 3) and motor commands (N, 4), and its recorded launch."""
+        warp, like = load_warp(), self.state
+        buffers = [like.new_empty(len(like), size) for size in (4, 3, 4)]
+        inputs = [self.constants, *map(warp.from_torch, buffers), *arrays(self, like)]
+        kernel, device = make_kernels(like.dtype)[2], warp.device_from_torch(like.device)
+        return buffers, warp.launch(kernel, len(like), inputs=inputs, device=device, record_cmd=True)
 
-    def _correct(self, gyro: Tensor, throttle: Tensor) -> Tensor:
-        """Return P + I + D (N, 3), in thousandths of the motors' range."""
-        p, own, dt = self.parameters, self.drone_parameters, self.dt
-        filters = own[:, DroneParameter.FILTERS]
-        gyro = self._lowpass(Row.GYRO_LPF2, gyro, lowpass_gain(p.gyro_lpf2 * filters[:, :1], dt))
-        cutoff = dynamic_cutoff(p.gyro_lpf1, p.lpf_expo, throttle) * filters[:, :1]
-        gyro = self._lowpass(Row.GYRO_LPF1, gyro, lowpass_gain(cutoff, dt))
-        before = self.state[:, Row.DTERM_LPF2].clone()
-        cutoff = dynamic_cutoff(p.dterm_lpf1, p.lpf_expo, throttle) * filters[:, 1:2]
-        slow = self._lowpass(Row.DTERM_LPF1, gyro, lowpass_gain(cutoff, dt))
-        slow = self._lowpass(Row.DTERM_LPF2, slow, lowpass_gain(p.dterm_lpf2 * filters[:, 1:2], dt))
+    @cached_property
+    def constants(self) -> Any:
+        """The kernels' struct of what all flight controllers share."""
+        drone, p, dt = self._drone, self.parameters, self._drone.physics_dt
+        firmware = make_kernels(self.state.dtype)[0]()
 
-        setpoint = self.state[:, Row.SETPOINT]
-        error = setpoint - gyro
-        moving = (setpoint - self._lowpass(Row.RELAX, setpoint, lowpass_gain(p.iterm_relax_cutoff, dt))).abs()
-        relax = (1.0 - self.level * moving / p.iterm_relax_threshold).clamp(min=0.0)
-        lift = p.anti_gravity_gain * self.state[:, Row.ANTI_GRAVITY, 1:2]  # (N, 1)
-        proportional = self._lowpass(Row.P, self.p * own[:, DroneParameter.P] * error, self.p_gain)
-        calm = (setpoint.abs() / 50.0).clamp(min=1.0)
-        proportional = proportional * (1.0 + self.level * lift / calm * betaflight.ANTI_GRAVITY_P)
-        gain = self.i * own[:, DroneParameter.I] + self.level * lift * betaflight.ANTI_GRAVITY_I
-        integral = self.state[:, Row.I] + gain * dt * relax * error
-        limit = p.iterm_windup * self.sum_limit
-        self.state[:, Row.I] = integral = torch.minimum(torch.maximum(integral, -limit), limit)
+        def tensor(*values: float) -> Tensor:
+            return torch.tensor(values, dtype=self.state.dtype)
 
-        boost = self.d_rise * self.state[:, Row.SETPOINT_MEAN].abs() * (p.d_max_advance * betaflight.D_MAX_SCALE)
-        gain_of_boost = lowpass_gain(betaflight.D_MAX_CUTOFF * betaflight.PT2_CORRECTION, dt)
-        boost = self._lowpass(Row.BOOST_2, self._lowpass(Row.BOOST_1, boost, gain_of_boost), gain_of_boost)
-        rise = 1.0 + torch.minimum(boost, self.d_rise)
-        excess = (throttle - p.tpa_breakpoint).clamp(min=0.0)
-        attenuation = 1.0 - p.tpa_rate / (1.0 - p.tpa_breakpoint) * excess
-        derivative = self.d * own[:, DroneParameter.D] * (before - slow) / dt * rise * attenuation
-        total = proportional + integral + derivative
-        return torch.minimum(torch.maximum(total, -self.sum_limit), self.sum_limit)
+        rises = [max(high / low - 1.0, 0.0) if low else 0.0 for low, high in zip(p.d, p.d_max, strict=True)]
+        vectors = {
+            "full_stick": tensor(*map(full_stick, drone.body_rate_max)),
+            "p": tensor(*p.p) * betaflight.P_SCALE,
+            "i": tensor(*p.i) * betaflight.I_SCALE * tensor(1.0, 1.0, betaflight.YAW_I_SCALE),
+            "d": tensor(*p.d) * betaflight.D_SCALE,
+            "d_rise": tensor(*rises),
+            "sum_limit": tensor(*p.sum_limit),
+            "i_limit": p.iterm_windup * tensor(*p.sum_limit),
+            "p_gain": tensor(1.0, 1.0, lowpass_gain(p.yaw_lowpass, dt)),
+            "level": tensor(1.0, 1.0, 0.0),
+        }
+        for name, values in vectors.items():
+            setattr(firmware, name, values.tolist())
+        interval, twice = 1.0 / p.link_rate, betaflight.PT2_CORRECTION
+        firmware.dt, firmware.radian = dt, 2.0 * torch.pi * dt
+        firmware.thrust_max, firmware.idle = self.thrust_max, p.motor_idle
+        firmware.throttle_way = 2000.0 - p.min_check
+        firmware.frame_steps, firmware.link_rate = float(self.frame_steps), p.link_rate
+        firmware.setpoint_gain = interval / (interval + p.setpoint_smoothing)
+        firmware.gyro_low, firmware.gyro_high = p.gyro_lpf1
+        firmware.dterm_low, firmware.dterm_high = p.dterm_lpf1
+        firmware.gyro_lpf2, firmware.dterm_lpf2, firmware.expo = p.gyro_lpf2, p.dterm_lpf2, p.lpf_expo
+        firmware.relax_gain, firmware.relax_threshold = lowpass_gain(p.iterm_relax_cutoff, dt), p.iterm_relax_threshold
+        firmware.boost = p.d_max_advance * betaflight.D_MAX_SCALE
+        firmware.boost_gain = lowpass_gain(betaflight.D_MAX_CUTOFF * twice, dt)
+        firmware.lift_gain, firmware.lift_cutoff = p.anti_gravity_gain, lowpass_gain(p.anti_gravity_cutoff * twice, dt)
+        firmware.lift_p, firmware.lift_i = betaflight.ANTI_GRAVITY_P, betaflight.ANTI_GRAVITY_I
+        firmware.tpa, firmware.tpa_breakpoint = p.tpa_rate / (1.0 - p.tpa_breakpoint), p.tpa_breakpoint
+        return firmware
 
-    def _update_anti_gravity(self, throttle: Tensor) -> None:
-        """Low-pass the throttle's changes for anti-gravity, weighted more at low and at falling throttle (N, 1)."""
-        p, state = self.parameters, self.state
-        low = 1.0 - throttle
-        change = throttle - state[:, Row.THROTTLE, 1:2]
-        weighted_change = change.abs() / self.dt * low * low * torch.where(change > 0.0, 0.5 * low, 1.0)
-        gain = lowpass_gain(p.anti_gravity_cutoff * betaflight.PT2_CORRECTION, self.dt)
-        first = state[:, Row.ANTI_GRAVITY, :1] + gain * (weighted_change - state[:, Row.ANTI_GRAVITY, :1])
-        second = state[:, Row.ANTI_GRAVITY, 1:2] + gain * (first - state[:, Row.ANTI_GRAVITY, 1:2])
-        state[:, Row.ANTI_GRAVITY, :1], state[:, Row.ANTI_GRAVITY, 1:2] = first, second
-        state[:, Row.THROTTLE, 1:2] = throttle.clone()
 
-    def _mix(self, correction: Tensor, throttle: Tensor) -> Tensor:
-        """Mix a correction (N, 3), as a share of the motors' range, and the throttle into motor commands (N, 4)."""
-        idle = self.parameters.motor_idle
-        mix = (correction.unsqueeze(-1) * self.mix).sum(1)  # (N, 4)
-        low, high = mix.amin(1, keepdim=True).clamp(max=0.0), mix.amax(1, keepdim=True).clamp(min=0.0)
-        scale = 1.0 / (high - low).clamp(min=1.0)
-        throttle = torch.minimum(torch.maximum(throttle, -scale * low), 1.0 - scale * high)
-        return idle + (1.0 - idle) * (scale * mix + throttle).clamp(0.0, 1.0)
+def arrays(rate_loop: RateLoop | None, like: Tensor) -> list[Any]:
+    """Return a rate loop's state and per-drone parameters as warp arrays; two dummy arrays if there is none."""
+    warp = load_warp()
+    none = like.new_zeros(1, 1, 3)
+    tensors = (none, none) if rate_loop is None else (rate_loop.state, rate_loop.drone_parameters)
+    row = warp.types.vector(3, warp.dtype_from_torch(like.dtype))
+    return [warp.from_torch(tensor, dtype=row) for tensor in tensors]
+
+
+def lowpass_gain(cutoff: Any, dt: float) -> Any:
+    """Return the gain of a first-order low-pass in a step of ``dt``, as in Betaflight's PT1."""
+    omega = 2.0 * math.pi * dt * cutoff
+    return omega / (omega + 1.0)
+
+
+@cache
+def make_kernels(dtype: torch.dtype) -> tuple[Any, Any, Any]:
+    """Make the struct of constants, `motor_commands`, and a kernel that only calls it, for a type of numbers."""
+    wp = load_warp()
+    real = wp.dtype_from_torch(dtype)
+    vec3, vec4 = wp.types.vector(3, real), wp.types.vector(4, real)
+
+    @wp.struct
+    class Firmware:
+        dt: real  # s
+        radian: real  # s, 2π times the step
+        thrust_max: real  # N
+        idle: real
+        throttle_way: real  # µs
+        frame_steps: real
+        link_rate: real  # Hz
+        full_stick: vec3  # deg/s
+        setpoint_gain: real
+        p: vec3
+        i: vec3
+        d: vec3
+        d_rise: vec3  # at most
+        sum_limit: vec3
+        i_limit: vec3
+        p_gain: vec3  # of P's low-pass: yaw only
+        level: vec3  # axes with I-term relax and anti-gravity
+        gyro_low: real  # Hz
+        gyro_high: real
+        gyro_lpf2: real
+        dterm_low: real
+        dterm_high: real
+        dterm_lpf2: real
+        expo: real
+        relax_gain: real
+        relax_threshold: real  # deg/s
+        boost: real
+        boost_gain: real
+        lift_gain: real
+        lift_cutoff: real
+        lift_p: real
+        lift_i: real
+        tpa: real
+        tpa_breakpoint: real
+
+    @wp.func
+    def share(f: Firmware, cutoff: real):  # gain of a low-pass in a step
+        omega = f.radian * cutoff
+        return omega / (omega + real(1.0))
+
+    @wp.func
+    def cutoff_at(f: Firmware, low: real, high: real, throttle: real):
+        return low + (high - low) * throttle * (real(1.0) + (real(1.0) - throttle) * f.expo)
+
+    @wp.func
+    def throttle_of(f: Firmware, thrust: real):
+        motor = wp.sqrt(wp.clamp(thrust / f.thrust_max, real(0.0), real(1.0)))
+        way = (motor - f.idle) / (real(1.0) - f.idle)
+        return wp.clamp(wp.floor(way * f.throttle_way + real(0.5)) / f.throttle_way, real(0.0), real(1.0))
+
+    @wp.func
+    def receive(f: Firmware, i: int, thrust: real, rates: vec3, memory: wp.array2d(dtype=vec3)):
+        held = memory[i, Row.THROTTLE]
+        if held[2] <= real(0.0):
+            wanted = vec3()
+            before = memory[i, Row.SETPOINT_SPEED]
+            for axis in range(3):
+                stick = wp.clamp(rates[axis] * real(DEGREES) / f.full_stick[axis], real(-1.0), real(1.0))
+                wanted[axis] = wp.floor(real(500.0) * stick + real(0.5)) / real(500.0) * f.full_stick[axis]
+            smooth = before + f.setpoint_gain * (f.link_rate * (wanted - memory[i, Row.SETPOINT]) - before)
+            memory[i, Row.SETPOINT] = wanted
+            memory[i, Row.SETPOINT_SPEED] = smooth
+            memory[i, Row.SETPOINT_MEAN] = real(0.5) * (before + smooth)
+            held = vec3(throttle_of(f, thrust), held[1], f.frame_steps)
+        memory[i, Row.THROTTLE] = vec3(held[0], held[1], held[2] - real(1.0))
+
+    @wp.func
+    def feel_throttle(f: Firmware, i: int, memory: wp.array2d(dtype=vec3)):
+        held = memory[i, Row.THROTTLE]
+        felt = memory[i, Row.ANTI_GRAVITY]
+        low = real(1.0) - held[0]
+        change = held[0] - held[1]
+        moved = wp.abs(change) / f.dt * low * low
+        if change > real(0.0):
+            moved = moved * real(0.5) * low
+        first = felt[0] + f.lift_cutoff * (moved - felt[0])
+        memory[i, Row.ANTI_GRAVITY] = vec3(first, felt[1] + f.lift_cutoff * (first - felt[1]), real(0.0))
+        memory[i, Row.THROTTLE] = vec3(held[0], held[0], held[2])
+
+    @wp.func
+    def mix(f: Firmware, throttle: real, c: vec3):
+        shares = vec4(-c[0] + c[1] + c[2], -c[0] - c[1] - c[2], c[0] + c[1] - c[2], c[0] - c[1] + c[2])
+        low, high = wp.min(wp.min(shares), real(0.0)), wp.max(wp.max(shares), real(0.0))
+        scale = real(1.0) / wp.max(high - low, real(1.0))
+        moved = wp.min(wp.max(throttle, -scale * low), real(1.0) - scale * high)
+        for rotor in range(4):
+            turned = wp.clamp(scale * shares[rotor] + moved, real(0.0), real(1.0))
+            shares[rotor] = f.idle + (real(1.0) - f.idle) * turned
+        return shares
+
+    @wp.func
+    def filter_gyro(
+        f: Firmware, i: int, rates: vec3, throttle: real, memory: wp.array2d(dtype=vec3), own: wp.array2d(dtype=vec3)
+    ):  # returns the filtered rates for P and I, and the decrease of those for D
+        filters = own[i, DroneParameter.FILTERS]
+        first = memory[i, Row.GYRO_LPF2]
+        first = first + share(f, f.gyro_lpf2 * filters[0]) * (real(DEGREES) * rates - first)
+        gyro = memory[i, Row.GYRO_LPF1]
+        gyro = gyro + share(f, cutoff_at(f, f.gyro_low, f.gyro_high, throttle) * filters[0]) * (first - gyro)
+        slow = memory[i, Row.DTERM_LPF1]
+        slow = slow + share(f, cutoff_at(f, f.dterm_low, f.dterm_high, throttle) * filters[1]) * (gyro - slow)
+        before = memory[i, Row.DTERM_LPF2]
+        slower = before + share(f, f.dterm_lpf2 * filters[1]) * (slow - before)
+        memory[i, Row.GYRO_LPF2] = first
+        memory[i, Row.GYRO_LPF1] = gyro
+        memory[i, Row.DTERM_LPF1] = slow
+        memory[i, Row.DTERM_LPF2] = slower
+        return gyro, before - slower
+
+    @wp.func
+    def motor_commands(
+        f: Firmware,
+        i: int,
+        thrust: real,
+        wanted: vec3,
+        rates: vec3,
+        memory: wp.array2d(dtype=vec3),
+        own: wp.array2d(dtype=vec3),
+    ):  # advances flight controller i by a physics step; returns its motor commands
+        receive(f, i, thrust, wanted, memory)
+        throttle = memory[i, Row.THROTTLE][0]
+        setpoint = memory[i, Row.SETPOINT]
+        gyro, change = filter_gyro(f, i, rates, throttle, memory, own)
+        relaxed = memory[i, Row.RELAX]
+        relaxed = relaxed + f.relax_gain * (setpoint - relaxed)
+        proportional = memory[i, Row.P]
+        integral = memory[i, Row.I]
+        boost_1 = memory[i, Row.BOOST_1]
+        boost_2 = memory[i, Row.BOOST_2]
+        mean = memory[i, Row.SETPOINT_MEAN]
+        lift = f.lift_gain * memory[i, Row.ANTI_GRAVITY][1]
+        own_p, own_i, own_d = own[i, DroneParameter.P], own[i, DroneParameter.I], own[i, DroneParameter.D]
+        attenuation = real(1.0) - f.tpa * wp.max(throttle - f.tpa_breakpoint, real(0.0))
+        correction = vec3()
+        for axis in range(3):
+            error = setpoint[axis] - gyro[axis]
+            moving = wp.abs(setpoint[axis] - relaxed[axis])
+            relax = wp.max(real(1.0) - f.level[axis] * moving / f.relax_threshold, real(0.0))
+            now = f.p[axis] * own_p[axis] * error
+            proportional[axis] = proportional[axis] + f.p_gain[axis] * (now - proportional[axis])
+            calm = wp.max(wp.abs(setpoint[axis]) / real(50.0), real(1.0))
+            lifted = proportional[axis] * (real(1.0) + f.level[axis] * lift / calm * f.lift_p)
+            gain = f.i[axis] * own_i[axis] + f.level[axis] * lift * f.lift_i
+            now = integral[axis] + gain * f.dt * relax * error
+            integral[axis] = wp.clamp(now, -f.i_limit[axis], f.i_limit[axis])
+            raised = f.d_rise[axis] * wp.abs(mean[axis]) * f.boost
+            boost_1[axis] = boost_1[axis] + f.boost_gain * (raised - boost_1[axis])
+            boost_2[axis] = boost_2[axis] + f.boost_gain * (boost_1[axis] - boost_2[axis])
+            rise = real(1.0) + wp.min(boost_2[axis], f.d_rise[axis])
+            derivative = f.d[axis] * own_d[axis] * change[axis] / f.dt * rise * attenuation
+            total = lifted + integral[axis] + derivative
+            correction[axis] = wp.clamp(total, -f.sum_limit[axis], f.sum_limit[axis]) / real(1000.0)
+        memory[i, Row.RELAX] = relaxed
+        memory[i, Row.P] = proportional
+        memory[i, Row.I] = integral
+        memory[i, Row.BOOST_1] = boost_1
+        memory[i, Row.BOOST_2] = boost_2
+        feel_throttle(f, i, memory)
+        return mix(f, throttle, correction)
+
+    @wp.kernel(module="unique", enable_backward=False)
+    def advance(
+        f: Firmware,
+        setpoint: wp.array2d(dtype=real),
+        rates: wp.array2d(dtype=real),
+        commands: wp.array2d(dtype=real),
+        memory: wp.array2d(dtype=vec3),
+        own: wp.array2d(dtype=vec3),
+    ):
+        i = wp.tid()
+        wanted = vec3(setpoint[i, 1], setpoint[i, 2], setpoint[i, 3])
+        gyro = vec3(rates[i, 0], rates[i, 1], rates[i, 2])
+        motors = motor_commands(f, i, setpoint[i, 0], wanted, gyro, memory, own)
+        for rotor in range(4):
+            commands[i, rotor] = motors[rotor]
+
+    return Firmware, motor_commands, advance

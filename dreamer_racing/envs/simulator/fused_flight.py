@@ -23,11 +23,11 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from dreamer_racing.envs.drone import rate_loop
 from dreamer_racing.envs.drone.parameters import GRAVITY, ROTOR_SPINS
 from dreamer_racing.envs.drone.quadrotor import Quadrotor
 from dreamer_racing.envs.drone.rate_loop import DroneParameter
 from dreamer_racing.envs.drone.rotation import rotate_inverse
-from dreamer_racing.envs.simulator import fused_rate_loop
 from dreamer_racing.envs.simulator.warp_device import load_warp
 
 
@@ -49,15 +49,14 @@ class FusedFlight:
         self, quadrotor: Quadrotor, qpos: Tensor, qvel: Tensor, qfrc_applied: Tensor, integrate: Callable[[], None]
     ) -> None:
         warp = load_warp()
-        apply_controls, correct_step, common, firmware = make_kernels(qpos.dtype)
+        apply_controls, correct_step, struct = make_kernels(qpos.dtype)
         steps, num_drones = quadrotor.parameters.physics_steps, len(qpos)
         self._integrate, self._qpos, self._qvel, self._dt = integrate, qpos, qvel, quadrotor.parameters.physics_dt
         self._path = torch.empty(steps + 1, num_drones, 3, dtype=qpos.dtype, device=qpos.device)
         self.qvel_before = before = torch.zeros_like(qvel, memory_format=torch.contiguous_format)
         arrays = [warp.from_torch(tensor) for tensor in (qpos, qvel, quadrotor.rotor_speed, quadrotor.setpoints)]
-        own = [*map(warp.from_torch, quadrotor.drones.values()), *fused_rate_loop.arrays(quadrotor.rate_loop, qpos)]
-        constants = _constants(quadrotor, common)
-        constants.firmware = fused_rate_loop.fill(quadrotor.rate_loop, firmware)
+        own = [*map(warp.from_torch, quadrotor.drones.values()), *rate_loop.arrays(quadrotor.rate_loop, qpos)]
+        constants = _constants(quadrotor, struct)
         force, saved, path = (warp.from_torch(tensor) for tensor in (qfrc_applied, before, self._path))
         effort = warp.from_torch(quadrotor.effort)
         device = warp.device_from_torch(qpos.device)
@@ -112,6 +111,8 @@ def _constants(quadrotor: Quadrotor, struct: Any) -> Any:
     constants.half_step = 0.5 * p.physics_dt
     constants.rate_gain = p.rate_gain
     constants.controlled = int(quadrotor.rate_loop is not None)
+    if quadrotor.rate_loop is not None:
+        constants.firmware = quadrotor.rate_loop.constants
     constants.lag_of_thrust = int(p.motor_lag_of == "thrust")
     constants.mass, constants.gravity = p.mass, (0.0, 0.0, -GRAVITY)
     constants.inertia, constants.drag = p.inertia, p.drag
@@ -125,8 +126,8 @@ def _constants(quadrotor: Quadrotor, struct: Any) -> Any:
 
 
 @cache
-def make_kernels(dtype: torch.dtype) -> tuple[Any, Any, Any, Any]:
-    """Make both kernels and the structs of constants, of all drones and of flight controllers, for a type of numbers.
+def make_kernels(dtype: torch.dtype) -> tuple[Any, Any, Any]:
+    """Make both kernels and the struct of constants of all drones, for a type of numbers.
 
     `apply_controls` runs controller and motors for a physics step and writes the force and torque that MuJoCo applies;
     `correct_step` corrects MuJoCo's Euler step and stores the position. warp compiles them at the first launch.
@@ -134,8 +135,7 @@ def make_kernels(dtype: torch.dtype) -> tuple[Any, Any, Any, Any]:
     wp = load_warp()
     real = wp.dtype_from_torch(dtype)
     vec3, vec4 = wp.types.vector(3, real), wp.types.vector(4, real)
-    Firmware, motor_commands = fused_rate_loop.make_kernels(dtype)
-    motors_row = int(DroneParameter.MOTORS)
+    Firmware, motor_commands = rate_loop.make_kernels(dtype)[:2]
 
     @wp.struct
     class Constants:
@@ -284,7 +284,7 @@ def make_kernels(dtype: torch.dtype) -> tuple[Any, Any, Any, Any]:
         if c.controlled != 0:
             commands = motor_commands(c.firmware, i, setpoints[age, i, 0], wanted, rates, memory, own)
             target = c.limit * wp.cw_mul(commands, commands)
-            motors = own[i, motors_row]
+            motors = own[i, DroneParameter.MOTORS]
             decay, decay_half, sag = motors[0], motors[1], motors[2]
         else:
             middle_rates = half_a_step_later(c, rates, torque_of(c, wp.cw_mul(speed, speed)))
@@ -338,4 +338,4 @@ def make_kernels(dtype: torch.dtype) -> tuple[Any, Any, Any, Any]:
         for axis in range(3):
             path[physics_step + 1, i, axis] = qpos[i, axis]
 
-    return apply_controls, correct_step, Constants, Firmware
+    return apply_controls, correct_step, Constants
