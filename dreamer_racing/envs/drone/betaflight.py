@@ -13,15 +13,7 @@ not documented.
 import math
 from dataclasses import dataclass
 
-from dreamer_racing.settings import (
-    NOT_NEGATIVE,
-    POSITIVE,
-    SHARE,
-    Range,
-    check_settings,
-    check_three,
-    setting,
-)
+from dreamer_racing.settings import NOT_NEGATIVE, POSITIVE, SHARE, Range, check_settings, check_three, setting
 
 P_SCALE, I_SCALE, D_SCALE = 0.032029, 0.244381, 0.000529
 """Values of one unit of the gains, in thousandths of the motor range per deg/s, deg and deg/s² [doc]."""
@@ -61,9 +53,8 @@ class BetaflightParameters:
     # D-max by the setpoint's change [rec]; the default is 20, with a feedforward boost that is not modelled. D-max by
     # the gyro (d_max_gain) has no visible effect in the recording and is not modelled
     d_max_advance: float = setting(40.0, NOT_NEGATIVE)
-    setpoint_smoothing: float = setting(
-        0.0074, NOT_NEGATIVE
-    )  # s, time constant of the setpoint's change: feedforward_smooth_factor 65
+    # s, time constant of the setpoint's change: feedforward_smooth_factor 65
+    setpoint_smoothing: float = setting(0.0074, NOT_NEGATIVE)
     gyro_lpf1: tuple[float, float] = (250.0, 500.0)  # Hz, first order, at zero and full throttle [doc]
     gyro_lpf2: float = setting(500.0, POSITIVE)  # Hz, first order [doc]
     dterm_lpf1: tuple[float, float] = (75.0, 150.0)  # Hz, first order, at zero and full throttle [doc]

@@ -151,12 +151,7 @@ PRESETS: dict[str, QuadrotorParameters] = {
         command_delay=0.010,  # [rec]: from the RC channel to the controller
         physics_dt=0.001,  # [rec]: the firmware's loop period
         randomisation=Randomisation(
-            gains=0.2,
-            filters=0.2,
-            motor_lag=0.3,
-            sag_max=0.15,
-            delay_min=0.005,
-            delay_max=0.035,
+            gains=0.2, filters=0.2, motor_lag=0.3, sag_max=0.15, delay_min=0.005, delay_max=0.035
         ),
     ),
 }

@@ -138,7 +138,7 @@ class GateSweeper:
         self._high = torch.tensor(track.bounds_high, device=device, dtype=dtype).view(3, 1, 1)
         floor_cause = CrashCause.GROUND if low_z <= GROUND_HEIGHT else CrashCause.OUT_OF_BOUNDS
         wall = CrashCause.OUT_OF_BOUNDS
-        # One cause for each row of the times in `_first_crash`.
+        # one cause for each row of the crash times in `__call__`
         self._causes = torch.tensor(
             [
                 CrashCause.GATE_FRAME,
@@ -183,7 +183,8 @@ class GateSweeper:
             beside = crossings.crossed & crossings.forward & (offset >= self._half_outer) & near
             missed = beside & (self._gates == target_gate) & (crossings.time < pass_time)
             crash_times.append(_first(missed, crossings.time).unsqueeze(0))
-        crash_time, crash = self._first_crash(torch.cat(crash_times))
+        crash_time, row = torch.cat(crash_times).min(0)  # at equal times the first row wins
+        crash = torch.where(crash_time.isfinite(), self._causes[row], int(CrashCause.NONE))
         passed = pass_time < crash_time
         passes = passed.long()
         if self._two_in_reach:
@@ -214,11 +215,7 @@ class GateSweeper:
         return forward, left, z - self._centre_up
 
     def _first_pass(
-        self,
-        crossings: _Crossings,
-        through: torch.Tensor,
-        target_gate: torch.Tensor,
-        after: torch.Tensor | None = None,
+        self, crossings: _Crossings, through: torch.Tensor, target_gate: torch.Tensor, after: torch.Tensor | None = None
     ) -> tuple[torch.Tensor, torch.Tensor]:
         """Return the time of the first target gate pass later than ``after`` (inf: none) and its offset, (N,)."""
         num_steps = through.shape[1]
@@ -278,14 +275,6 @@ class GateSweeper:
         leaving = (after < 0) & (before >= 0)
         time = torch.where(leaving, segment + before / (before - after), math.inf)
         return time.amin(1)
-
-    def _first_crash(self, times: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-        """Return the earliest of the crash times (rows, N) and its cause, both (N,); at equal times the first row wins.
-
-        The rows are in the order of `_causes`.
-        """
-        time, row = times.min(0)
-        return time, torch.where(time.isfinite(), self._causes[row], int(CrashCause.NONE))
 
 
 def _first(event: torch.Tensor, time: torch.Tensor) -> torch.Tensor:

@@ -21,12 +21,7 @@ class RayCaster:
     """
 
     def __init__(
-        self,
-        model: mujoco.MjModel,
-        camera: Camera,
-        frames: int,
-        device: torch.device | str,
-        varied_looks: bool = False,
+        self, model: mujoco.MjModel, camera: Camera, frames: int, device: torch.device | str, varied_looks: bool = False
     ) -> None:
         warp = load_warp()
         import mujoco_warp

@@ -34,12 +34,7 @@ from torch import Tensor
 
 from dreamer_racing.envs.simulator.camera_view import NoseMount
 from dreamer_racing.envs.simulator.looks import Looks
-from dreamer_racing.envs.simulator.opengl import (
-    GL_LIBRARIES,
-    RendererUnavailableError,
-    open_scene,
-    require_library,
-)
+from dreamer_racing.envs.simulator.opengl import GL_LIBRARIES, RendererUnavailableError, open_scene, require_library
 from dreamer_racing.envs.simulator.ray_caster import RayCaster
 from dreamer_racing.envs.simulator.scene import Camera
 
@@ -221,15 +216,7 @@ class OpenGLWorker:
 def make_renderer(
     name: str, model: mujoco.MjModel, camera: Camera, num_envs: int, num_workers: int, varied_looks: bool = False
 ) -> Renderer:
-    """Make a renderer by name, or the first that works for `auto`; log which one and why.
-
-    Args:
-        name: `auto`, or a name from `RENDERERS`, or `WARP_CUDA`.
-        model: the compiled scene.
-        camera: the nose camera.
-        num_envs: maximum number of frames per call.
-        num_workers: number of threads.
-        varied_looks: whether looks may differ between frames.
+    """Make a renderer of at most `num_envs` frames per call by name, or for `auto` the first that works; log which.
 
     Raises:
         ValueError: unknown name.

@@ -14,7 +14,7 @@ import mujoco
 import numpy as np
 
 from dreamer_racing.envs.drone.parameters import GRAVITY, QuadrotorParameters
-from dreamer_racing.envs.tracks import Gate, Track
+from dreamer_racing.envs.tracks import Track
 from dreamer_racing.settings import (
     COUNT,
     FINITE,
@@ -277,23 +277,18 @@ def _add_gates(spec: mujoco.MjSpec, track: Track) -> None:
         ((-depth, inner, -inner), (depth, outer, inner), "x-x+y-y+"),
     ]
     _add_box_mesh(spec, "gate", bars)
-    for index, gate in enumerate(track.gates):
-        _add_gate(spec, f"gate_{index}", gate, gate.color or RACE_GATE)
-    for index, gate in enumerate(track.decoys):
-        _add_gate(spec, f"decoy_{index}", gate, gate.color or DECOY_GATE)
-
-
-def _add_gate(spec: mujoco.MjSpec, name: str, gate: Gate, rgb: Sequence[float]) -> None:
-    half_yaw = math.radians(gate.yaw_degrees) / 2
-    spec.worldbody.add_geom(
-        name=name,
-        type=mujoco.mjtGeom.mjGEOM_MESH,
-        meshname="gate",
-        pos=gate.position,
-        quat=(math.cos(half_yaw), 0.0, 0.0, math.sin(half_yaw)),
-        material=_material(spec, rgb),
-        **IN_HALL,
-    )
+    for kind, gates, usual in (("gate", track.gates, RACE_GATE), ("decoy", track.decoys, DECOY_GATE)):
+        for index, gate in enumerate(gates):
+            half_yaw = math.radians(gate.yaw_degrees) / 2
+            spec.worldbody.add_geom(
+                name=f"{kind}_{index}",
+                type=mujoco.mjtGeom.mjGEOM_MESH,
+                meshname="gate",
+                pos=gate.position,
+                quat=(math.cos(half_yaw), 0.0, 0.0, math.sin(half_yaw)),
+                material=_material(spec, gate.color or usual),
+                **IN_HALL,
+            )
 
 
 def gate_materials(model: mujoco.MjModel) -> list[int]:

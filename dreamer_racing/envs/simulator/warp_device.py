@@ -14,6 +14,8 @@ from torch import Tensor
 
 from dreamer_racing.caches import ensure_caches
 
+WARMUPS = 3  # calls of a function before it is captured
+
 
 @cache
 def load_warp() -> Any:
@@ -78,16 +80,15 @@ class GraphedFunction:
     Args:
         function: what to capture.
         example: an input, on the CUDA device.
-        warmups: calls before the capture.
     """
 
-    def __init__(self, function: Callable[[Tensor], Sequence[Tensor]], example: Tensor, warmups: int = 3) -> None:
+    def __init__(self, function: Callable[[Tensor], Sequence[Tensor]], example: Tensor) -> None:
         warp, device = load_warp(), example.device
         self._input = example.clone()
         stream = torch.cuda.Stream(device)
         stream.wait_stream(torch.cuda.current_stream(device))
         with torch.cuda.device(device), torch.cuda.stream(stream), scope(device):
-            for _ in range(warmups):
+            for _ in range(WARMUPS):
                 function(self._input)
             torch.cuda.synchronize(device)
             self._graph = torch.cuda.CUDAGraph()

@@ -212,9 +212,11 @@ def make_track(
     if start_position is not None:
         require_vector(source, "start.position", start_position := _as_tuple(start_position))
     else:
-        start_position = _point_before(gates[0], START_DISTANCE)
+        (x, y, z), (along_x, along_y, _) = gates[0].position, gates[0].forward
+        start_position = (x - START_DISTANCE * along_x, y - START_DISTANCE * along_y, z)
     if start_yaw_degrees is None:
-        start_yaw_degrees = _bearing(start_position, gates[0].position)
+        (x, y, _), (to_x, to_y, _) = start_position, gates[0].position
+        start_yaw_degrees = math.degrees(math.atan2(to_y - y, to_x - x))
     default_low, default_high = _default_bounds(gates, shape)
     return Track(
         name=name,
@@ -263,17 +265,6 @@ def require_number(source: str, field: str, value: object) -> None:
 def _is_finite(value: object) -> bool:
     value = _as_float(value)
     return isinstance(value, float) and math.isfinite(value)
-
-
-def _point_before(gate: Gate, distance: float) -> Vector:
-    """Return the point ``distance`` m before a gate's centre, at its height."""
-    x, y, z = gate.position
-    return (x - distance * gate.forward[0], y - distance * gate.forward[1], z)
-
-
-def _bearing(origin: Vector, target: Vector) -> float:
-    """Return the heading from one point to another, degrees."""
-    return math.degrees(math.atan2(target[1] - origin[1], target[0] - origin[0]))
 
 
 def _default_bounds(gates: Sequence[Gate], shape: GateShape) -> tuple[Vector, Vector]:

@@ -13,12 +13,13 @@ from dreamer_racing.envs.tracks.validation import validate_track
 if TYPE_CHECKING:
     import torch
 
-DECOYS = {"paper": {"figure8": "figure8_decoys"}}
-"""Sets of decoys: for each set, the plain tracks that have it and the built-in track with these decoys."""
+DECOYS = "paper"
+"""Name of the set of decoys."""
 
-PLAIN_TRACKS: tuple[str, ...] = tuple(
-    name for name in BUILTIN_TRACKS if not any(name in places.values() for places in DECOYS.values())
-)
+DECORATED = {"figure8": "figure8_decoys"}
+"""The plain tracks that have these decoys, and for each the built-in track with them."""
+
+PLAIN_TRACKS: tuple[str, ...] = tuple(name for name in BUILTIN_TRACKS if name not in DECORATED.values())
 """Built-in tracks, without those that only add decoys to another one, which are the same race."""
 
 ATTEMPTS = 1000
@@ -42,36 +43,27 @@ def with_decoys(track: str | Path | Track, decoys: str | None) -> Track:
     loaded = load_track(track)
     if decoys is None:
         return loaded
+    if decoys not in (DECOYS, "none"):
+        raise TrackError(f"decoys={decoys}: must be {DECOYS} or none.")
+    for plain, decorated in _pairs():
+        if loaded in (plain, decorated):
+            return plain if decoys == "none" else decorated
     if decoys == "none":
-        return _without_decoys(loaded)
-    if decoys not in DECOYS:
-        raise TrackError(f"decoys={decoys}: must be {', '.join(DECOYS)} or none.")
-    places = DECOYS[decoys]
-    decorated = {plain: load_track(name) for plain, name in places.items()}
-    for plain, target in decorated.items():
-        if loaded in (target, load_track(plain)):
-            return target
+        return dataclasses.replace(loaded, decoys=())
     raise TrackError(
-        f"decoys={decoys} is for track={', '.join(places)}; track {loaded.name!r} has no place for them. A track file "
-        "may list decoys of its own."
+        f"decoys={decoys} is for track={', '.join(DECORATED)}; track {loaded.name!r} has no place for them. A track "
+        "file may list decoys of its own."
     )
 
 
 def decoys_for(track: Track) -> str | None:
     """Return the name of the set of decoys that a track has or can have; None if there is none."""
-    for name, places in DECOYS.items():
-        if any(track in (load_track(plain), load_track(decorated)) for plain, decorated in places.items()):
-            return name
-    return None
+    return DECOYS if any(track in pair for pair in _pairs()) else None
 
 
-def _without_decoys(track: Track) -> Track:
-    """Remove the decoys; for a built-in variant, return the plain track."""
-    for places in DECOYS.values():
-        for plain, decorated in places.items():
-            if track == load_track(decorated):
-                return load_track(plain)
-    return dataclasses.replace(track, decoys=())
+def _pairs() -> list[tuple[Track, Track]]:
+    """Return the tracks of `DECORATED`, without decoys and with them."""
+    return [(load_track(plain), load_track(decorated)) for plain, decorated in DECORATED.items()]
 
 
 def displace_gates(track: Track, shift: float, turn_degrees: float, seed: int) -> Track:
