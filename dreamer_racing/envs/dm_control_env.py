@@ -40,7 +40,7 @@ from torch import Tensor
 from dreamer_racing.envs.drone.parameters import QuadrotorParameters, at_control_rate, load_preset
 from dreamer_racing.envs.drone.quadrotor import Quadrotor
 from dreamer_racing.envs.imu import Imu, ImuErrors, load_imu
-from dreamer_racing.envs.own import CustomFunction, RaceState, RaceStates, RewardFunction, Transition, VectorFunction
+from dreamer_racing.envs.own import CustomFunction, RaceState, RewardFunction, Transition, VectorFunction
 from dreamer_racing.envs.race.race import EPISODE_TIME, EVALUATION_TIME, Race, RaceStep, RaceVector, RewardWeights
 from dreamer_racing.envs.race.starts import StartSampler
 from dreamer_racing.envs.simulator.fused_flight import FusedFlight
@@ -310,7 +310,7 @@ class DroneRace(base.Task):
         cpu = torch.device("cpu")
         self._custom_reward = None if reward is None else CustomFunction("reward", reward, 1, cpu)
         self._custom_vector = None if vector is None else CustomFunction("vector", vector, 1, cpu)
-        self._states = RaceStates(self.race, RaceVector(track))
+        self._race_vector = RaceVector(track)
         self._action = torch.zeros(1, ACTION_SIZE)  # last applied action
         self._before: RaceState | None = None  # state before the current step
         self._imu_errors = imu
@@ -367,7 +367,8 @@ class DroneRace(base.Task):
     def _race_state(self, physics: Physics) -> RaceState:
         """Return the state that user-defined functions are given."""
         parts = (physics.position, physics.attitude, physics.linear_velocity, physics.body_rates)
-        return self._states(DroneState(*(torch.from_numpy(part()).unsqueeze(0) for part in parts)), self._action)
+        state = DroneState(*(torch.from_numpy(part()).unsqueeze(0) for part in parts))
+        return RaceState.of(self.race, self._race_vector, state, self._action)
 
     def get_observation(self, physics: Physics) -> "collections.OrderedDict[str, np.ndarray]":
         """Return the observations of the module's table."""

@@ -46,6 +46,19 @@ class RaceState:
         """(N, 21) the drone's state, the target gate and the gate after it, in the body frame; see `RaceVector`."""
         return self.make_race_vector()
 
+    @classmethod
+    def of(cls, race: Race, vector: RaceVector, state: DroneState, action: Tensor) -> RaceState:
+        """Return copies of the drones' state, with their last applied action (N, 4) and target gate."""
+        whole = DroneState(**{each.name: getattr(state, each.name).nan_to_num(0.0, 0.0, 0.0) for each in fields(state)})
+        return cls(
+            **{name: value.float() for name, value in vars(whole).items()},
+            action=action.clone(),
+            gate_position=race.gate_positions[race.target_gate],
+            gate_direction=race.gate_normals[race.target_gate],
+            time=race.step_count * race.control_dt,
+            make_race_vector=partial(vector, whole, race.target_gate.clone()),
+        )
+
 
 @dataclass(frozen=True)
 class Transition:
@@ -68,28 +81,6 @@ RewardFunction: TypeAlias = Callable[[Transition], Tensor]
 """Function that returns the rewards, (N,) or (N, 1)."""
 VectorFunction: TypeAlias = Callable[[RaceState], Tensor]
 """Function that returns the observation ``vector``, (N, V)."""
-
-
-class RaceStates:
-    """Builds the `RaceState` of N drones."""
-
-    def __init__(self, race: Race, vector: RaceVector) -> None:
-        device = race.position.device
-        self._race, self._vector = race, vector
-        self._positions, self._directions = race.track.gate_positions(device), race.track.gate_normals(device)
-
-    def __call__(self, state: DroneState, action: Tensor) -> RaceState:
-        """Return copies of the drones' state, with their last applied action (N, 4) and target gate."""
-        race = self._race
-        whole = DroneState(**{each.name: getattr(state, each.name).nan_to_num(0.0, 0.0, 0.0) for each in fields(state)})
-        return RaceState(
-            **{name: value.float() for name, value in vars(whole).items()},
-            action=action.clone(),
-            gate_position=self._positions[race.target_gate],
-            gate_direction=self._directions[race.target_gate],
-            time=race.step_count * race.control_dt,
-            make_race_vector=partial(self._vector, whole, race.target_gate.clone()),
-        )
 
 
 class CustomFunction:

@@ -21,7 +21,7 @@ from dreamer_racing.envs.drone.parameters import (
 )
 from dreamer_racing.envs.held_frames import FrameHold
 from dreamer_racing.envs.imu import Imu, ImuErrors, load_imu
-from dreamer_racing.envs.own import CustomFunction, RaceState, RaceStates, RewardFunction, Transition, VectorFunction
+from dreamer_racing.envs.own import CustomFunction, RaceState, RewardFunction, Transition, VectorFunction
 from dreamer_racing.envs.race.race import (
     EPISODE_TIME,
     EVALUATION_TIME,
@@ -263,7 +263,6 @@ class RaceWorlds:
             raise ValueError("imu= and vector= cannot be combined: leave one of them out.")
         self.imu = None if errors is None else Imu(errors, self.simulator.ideal_imu, self._generator)
         self.race_vector = RaceVector(self.track, self.device, self.dtype)
-        self._states = RaceStates(self.race, self.race_vector)
         self._last_action = torch.zeros(self.num_envs, ACTION_SIZE, device=self.device)
         self.custom_vector, self.vector_size = None, RACE_VECTOR_SIZE
         if vector is not None:
@@ -480,7 +479,7 @@ class RaceWorlds:
 
     def race_state(self) -> RaceState:
         """Return copies of the state that user-defined functions are given."""
-        return self._states(self.simulator.state, self._last_action)
+        return RaceState.of(self.race, self.race_vector, self.simulator.state, self._last_action)
 
     def observed_vector(self) -> Tensor:
         """Return the observation `vector`, float32 (N, V): the user-defined function's, or the race vector."""

@@ -10,7 +10,6 @@ project's choice.
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
 
 import torch
 from tensordict import TensorDictBase
@@ -23,32 +22,6 @@ from dreamer_racing.envs.race.racing_line import Dynamics, LineLimits, Reference
 from dreamer_racing.envs.tracks import Track, load_track
 
 
-@dataclass(frozen=True)
-class PilotGains:
-    """Feedback gains and limits of the pilot."""
-
-    position: float = 14.0
-    """Acceleration per metre of lateral error, 1/s²."""
-    velocity: float = 6.0
-    """Acceleration per m/s of lateral velocity error, 1/s."""
-    progress: float = 3.0
-    """Gain of the speed error along the line, 1/s."""
-    attitude: float = 120.0
-    """Angular acceleration per radian of thrust axis error, 1/s²."""
-    body_rate: float = 17.0
-    """Angular acceleration per rad/s of rate error, 1/s."""
-    yaw: float = 5.0
-    """Yaw rate per radian of heading error, 1/s."""
-    correction_max: float = 10.0
-    """Maximum acceleration from lateral errors, m/s²."""
-    progress_max: float = 8.0
-    """Maximum acceleration from speed errors along the line, m/s²."""
-    look_ahead: float = 0.5
-    """The nose points to the line's position this much later, s."""
-    adaptation: float = 1.0
-    """Rate at which the thrust scale estimate follows the measurement, 1/s."""
-
-
 class ScriptedPilot:
     """Controller that flies N drones along the racing line of a track from their states.
 
@@ -59,7 +32,6 @@ class ScriptedPilot:
         track: name, path or `Track`.
         parameters: preset or parameters of the drone; the pilot uses only the nominal ones, without randomisation.
         limits: limits of the line; its `speed` sets the aggressiveness. None for the defaults.
-        gains: the feedback gains; None for the defaults.
 
     Example:
         >>> pilot = ScriptedPilot("circle")
@@ -71,19 +43,27 @@ class ScriptedPilot:
     WINDOW = 0.25  # s: the line is searched from this long before the last gate to this long after the target gate
     SEARCH_DT = 0.02  # s between the points of the search
     RESET_JUMP = 0.3  # m of displacement beyond the drone's own motion that indicates a reset
+    LOOK_AHEAD = 0.5  # s: the nose points to the line's position this much later
+    POSITION_GAIN = 14.0  # acceleration per metre of lateral error, 1/s²
+    VELOCITY_GAIN = 6.0  # acceleration per m/s of lateral velocity error, 1/s
+    PROGRESS_GAIN = 3.0  # of the speed error along the line, 1/s
+    CORRECTION_MAX = 10.0  # acceleration from lateral errors, m/s²
+    PROGRESS_MAX = 8.0  # acceleration from speed errors along the line, m/s²
+    ATTITUDE_GAIN = 120.0  # angular acceleration per radian of thrust axis error, 1/s²
+    BODY_RATE_GAIN = 17.0  # angular acceleration per rad/s of rate error, 1/s
+    YAW_GAIN = 5.0  # yaw rate per radian of heading error, 1/s
+    ADAPTATION = 1.0  # rate at which the thrust scale estimate follows the measurement, 1/s
 
     def __init__(
         self,
         track: str | Track,
         parameters: str | QuadrotorParameters = "easy",
         limits: LineLimits | None = None,
-        gains: PilotGains | None = None,
         device: torch.device | str = "cpu",
         dtype: torch.dtype = torch.float32,
     ) -> None:
         self.track, self.parameters = load_track(track), load_preset(parameters)
         self.limits = limits or LineLimits()
-        self.gains = gains or PilotGains()
         self._device, self._dtype = torch.device(device), dtype
         nominal = without_randomisation(self.parameters)
         self.line = plan_racing_line(self.track, nominal, self.limits).to(device, dtype)
@@ -109,12 +89,9 @@ class ScriptedPilot:
         points = [line.at(times).position for times in self._search_times]
         self._search_positions = torch.stack(points)  # (G, W, 3)
 
-    def reset(self, mask: Tensor | None = None) -> None:
-        """Clear the memory of the masked drones (N,) bool; of all if None."""
-        if mask is None:
-            self._last_position = None
-        elif self._last_position is not None:
-            self._last_position = torch.where(mask.unsqueeze(-1), math.nan, self._last_position)
+    def reset(self) -> None:
+        """Clear the memory of all drones."""
+        self._last_position = None
 
     @torch.no_grad()
     def act(
@@ -166,7 +143,7 @@ class ScriptedPilot:
         surplus = (measured / self._last_thrust.clamp(min=5.0)).clamp(0.7, 1.3) - 1.0
         # near the limit the mixer may trade thrust for roll and pitch, which must not affect the estimate
         known = (self._last_thrust > 8.0) & (self._last_thrust < 0.85 * dynamics.thrust_max)
-        scale = (self._thrust_scale * (1.0 + self.gains.adaptation * dt * known * surplus)).clamp(0.8, 1.2)
+        scale = (self._thrust_scale * (1.0 + self.ADAPTATION * dt * known * surplus)).clamp(0.8, 1.2)
         self._thrust_scale = torch.where(new, 1.0, scale)
         self._last_position, self._last_velocity = position.clone(), velocity.clone()
 
@@ -199,19 +176,18 @@ class ScriptedPilot:
         At a fraction λ of the line's speed, the line needs λ² of its acceleration, so the drone can start from rest or
         fall behind without being pushed off the line.
         """
-        gains = self.gains
         speed = reference.velocity.norm(dim=-1, keepdim=True).clamp(min=0.5)
         tangent = reference.velocity / speed
         progress = (velocity * tangent).sum(-1, keepdim=True) / speed
         beside = reference.position - position
         wanted = (1.2 - 0.4 * beside.norm(dim=-1, keepdim=True)).clamp(0.3, 1.0)
-        limit = gains.progress_max / speed
-        push = torch.minimum(torch.maximum(gains.progress * (wanted - progress), -limit), limit)
+        limit = self.PROGRESS_MAX / speed
+        push = torch.minimum(torch.maximum(self.PROGRESS_GAIN * (wanted - progress), -limit), limit)
         progress = progress.clamp(0.0, 1.3)
         drift = velocity - (velocity * tangent).sum(-1, keepdim=True) * tangent
-        correction = gains.position * beside - gains.velocity * drift
+        correction = self.POSITION_GAIN * beside - self.VELOCITY_GAIN * drift
         size = correction.norm(dim=-1, keepdim=True).clamp(min=1e-6)
-        correction = correction * (gains.correction_max / size).clamp(max=1.0)
+        correction = correction * (self.CORRECTION_MAX / size).clamp(max=1.0)
         acceleration = progress.square() * reference.acceleration + push * reference.velocity + correction
         return self._dynamics.force(velocity, acceleration), progress
 
@@ -228,7 +204,7 @@ class ScriptedPilot:
         self, force: Tensor, attitude: Tensor, body_rates: Tensor, reference: Reference, progress: Tensor
     ) -> Tensor:
         """Return roll and pitch rates (N, 2) in rad/s that align the thrust axis with the force."""
-        gains, loop = self.gains, self.parameters.rate_gain
+        loop = self.parameters.rate_gain
         wanted = torch.nn.functional.normalize(rotate_inverse(attitude, force), dim=-1)
         x, y, z = wanted.unbind(-1)
         sideways = torch.stack((-y, x, torch.zeros_like(x)), dim=-1)  # body z × wanted
@@ -236,17 +212,17 @@ class ScriptedPilot:
         error = sideways * (torch.atan2(sine, z.unsqueeze(-1)) / sine.clamp(min=1e-6))
         feedforward = rotate_inverse(attitude, progress * reference.body_rate)
         change = rotate_inverse(attitude, progress.square() * reference.angular_acceleration)
-        damping = (gains.body_rate / loop - 1.0) * (feedforward - body_rates)
-        rates = feedforward + damping + (change + gains.attitude * error) / loop
+        damping = (self.BODY_RATE_GAIN / loop - 1.0) * (feedforward - body_rates)
+        rates = feedforward + damping + (change + self.ATTITUDE_GAIN * error) / loop
         excess = (rates[:, :2].abs() / self._rate_max[:2]).amax(dim=-1, keepdim=True).clamp(min=1.0)
         return rates[:, :2] / excess
 
     def _yaw_rate(self, position: Tensor, attitude: Tensor, time: Tensor) -> Tensor:
         """Return the yaw rate (N, 1) in rad/s that points the nose ahead along the line."""
-        view = self.line.at(time + self.gains.look_ahead).position - position
+        view = self.line.at(time + self.LOOK_AHEAD).position - position
         x, y, _ = rotate_inverse(attitude, torch.nn.functional.normalize(view, dim=-1)).unbind(-1)
         level = (x.square() + y.square()).sqrt()  # near the yaw axis, the heading error is ill-conditioned
-        rate = self.gains.yaw * level * torch.atan2(y, x)
+        rate = self.YAW_GAIN * level * torch.atan2(y, x)
         return rate.clamp(-self._rate_max[2], self._rate_max[2]).unsqueeze(-1)
 
 

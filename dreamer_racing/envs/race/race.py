@@ -124,7 +124,8 @@ class Race:
         self.laps = laps
         self.control_dt = control_dt
         self._sweep = GateSweeper(track, device, dtype, miss_radius, reach=MAX_SPEED * control_dt)
-        self._gate_positions = track.gate_positions(device, dtype)
+        self.gate_positions = track.gate_positions(device, dtype)  # (G, 3) m
+        self.gate_normals = track.gate_normals(device, dtype)  # (G, 3)
         self._dtype = dtype
 
         def zeros() -> Tensor:
@@ -159,7 +160,7 @@ class Race:
         path, body_rates = path.to(self._dtype), body_rates.to(self._dtype)
         passes, gate_offset, crash = self._judge(path, body_rates, invalid_action)
         crashed = crash != CrashCause.NONE
-        gate = self._gate_positions[self.target_gate]
+        gate = self.gate_positions[self.target_gate]
         reward_base, body_rate_norm = race_reward(
             self.weights, gate, self.position, path[-1], body_rates, passes, crashed
         )
@@ -167,7 +168,7 @@ class Race:
         if self.laps is None:
             finished = torch.zeros_like(crashed)
         else:
-            finished = lap_complete & ~crashed & (self.gates_passed >= self.laps * len(self._gate_positions))
+            finished = lap_complete & ~crashed & (self.gates_passed >= self.laps * len(self.gate_positions))
         return RaceStep(
             reward_base=reward_base,
             body_rate_norm=body_rate_norm,
@@ -201,7 +202,7 @@ class Race:
 
     def _advance(self, passes: Tensor, position: Tensor) -> tuple[Tensor, Tensor]:
         """Advance every episode by one control step; return whether a lap was completed and its time, (N,), s."""
-        num_gates = len(self._gate_positions)
+        num_gates = len(self.gate_positions)
         self.position.copy_(position)
         self.step_count += 1
         self.gates_passed += passes

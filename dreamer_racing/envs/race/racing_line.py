@@ -64,7 +64,6 @@ class Reference:
     position: Tensor  # m
     velocity: Tensor  # m/s
     acceleration: Tensor  # m/s²
-    thrust_rate: Tensor  # m/s³, rate of change of the specific thrust vector
     body_rate: Tensor  # rad/s, world frame, without the component about the thrust axis
     angular_acceleration: Tensor  # rad/s², world frame
 
@@ -73,7 +72,7 @@ class RacingLine:
     """A closed line around a track as a function of time.
 
     Args:
-        samples: (K, 18) the columns of `Reference`, `LINE_DT`-spaced over one lap.
+        samples: (K, 15) the columns of `Reference`, `LINE_DT`-spaced over one lap.
         gate_times: (G,) times at which the line passes each gate, s.
         lap_time: s.
         dynamics: dynamics of the drone for which it was planned.
@@ -346,5 +345,5 @@ def _finish_line(nodes: LineNodes, dynamics: Dynamics) -> RacingLine:
     force_rate = jerk + dynamics.drag_sideways * acceleration
     _, body_rate = _axis_rate(dynamics.force(velocity, acceleration), force_rate)
     angular_acceleration = (body_rate.roll(-1, 0) - body_rate.roll(1, 0)) / (2 * lap_time / count)
-    columns = (position, velocity, acceleration, force_rate, body_rate, angular_acceleration)
+    columns = (position, velocity, acceleration, body_rate, angular_acceleration)
     return RacingLine(torch.cat(columns, dim=-1), start_times[nodes.gate_nodes], lap_time, dynamics)
