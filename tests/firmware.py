@@ -38,6 +38,7 @@ class Firmware:
         self._heard: float | None = None  # when the radio last spoke; None: never, or not since it was lost
         self._may_arm = self._was_armed = False
         self._loop = RateLoop(PRESETS["betaflight"], 1)
+        self._loop.motor_commands(torch.zeros(1, 4), torch.zeros(1, 3))  # compiled now, not in flight; arming resets it
 
     def hear(self, data: bytes) -> None:
         """Read a packet of the radio: f64 stamp, 16 u16 µs in the order AETR, then AUX1."""
