@@ -16,6 +16,7 @@ from torchrl.envs.utils import check_env_specs
 
 from dreamer_racing.envs import dm_control_env as task_module
 from dreamer_racing.envs import dm_control_gl
+from dreamer_racing.envs.control_suite import ControlSuiteEnv
 from dreamer_racing.envs.dm_control_env import load, open_nose
 from dreamer_racing.envs.race.gates import CrashCause
 from dreamer_racing.envs.race.pilot import ScriptedPilot
@@ -286,13 +287,17 @@ def test_viewer_style_loop_renders_any_size_and_the_drone_from_outside() -> None
     np.testing.assert_array_equal(env.task._view.render(), nose)  # whose own view other cameras leave alone
 
 
-def test_missing_opengl_is_explained(monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize(
+    "draw", [lambda: open_nose(load("circle").physics, Camera()), lambda: ControlSuiteEnv("cartpole_swingup", 1)]
+)
+def test_missing_opengl_is_explained(draw: Callable[[], object], monkeypatch: pytest.MonkeyPatch) -> None:
     def broken(*args: object) -> None:
         raise RuntimeError("No OpenGL rendering backend is available.")
 
     monkeypatch.setattr(task_module.mujoco, "Camera", broken)
-    with pytest.raises(RendererUnavailableError, match="No OpenGL rendering backend.*libegl1.*MUJOCO_GL=egl"):
-        open_nose(load("circle").physics, Camera())
+    words = "No OpenGL rendering backend.*libegl1.*MUJOCO_GL=egl.*from_pixels=False"
+    with pytest.raises(RendererUnavailableError, match=words):
+        draw()
 
 
 @pytest.mark.parametrize(

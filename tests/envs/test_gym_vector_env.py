@@ -195,12 +195,9 @@ def test_in_mode_disabled_episodes_begin_where_they_are_reset() -> None:
     envs.close()
 
 
-def test_an_unknown_autoreset_mode_is_refused() -> None:
+def test_unknown_modes_and_lengths_that_are_no_numbers_are_refused() -> None:
     with pytest.raises(ValueError, match="autoreset_mode='never': choose one of 'NextStep', 'SameStep', 'Disabled'"):
         make_vec(autoreset_mode="never")
-
-
-def test_a_length_that_is_no_number_is_refused() -> None:
     with pytest.raises(ValueError, match="max_episode_steps='300': must be a whole number"):
         make_vec(max_episode_steps="300", episode_steps=200)
 

@@ -103,18 +103,9 @@ GATE = torch.tensor([[10.0, 0.0, 0.0]])
 RATES = torch.tensor([[1.0, 2.0, 2.0]])  # norm 3
 
 
-def reward(previous, position, passes=0, crashed=False, weights=None, rates=RATES):
-    """Reward one drone."""
-    base, rate = race_reward(
-        weights or RewardWeights(),
-        GATE,
-        torch.tensor([previous]),
-        torch.tensor([position]),
-        rates,
-        torch.tensor([passes]),
-        torch.tensor([crashed]),
-    )
-    return base.item(), rate.item()
+ORIGIN, AHEAD = (0.0, 0.0, 0.0), (0.2, 0.0, 0.0)
+BEFORE, BEYOND = (9.9, 0.0, 0.0), (10.1, 0.0, 0.0)
+OTHERS = RewardWeights(progress=2.0, body_rate=0.5, gate=7.0, collision=-1.0)
 
 
 @pytest.mark.parametrize(
@@ -130,38 +121,29 @@ def test_defaults_are_the_papers():
 
 
 @pytest.mark.parametrize(
-    ("previous", "position", "progress"),
+    ("previous", "position", "given", "expected"),
     [
-        ((0.2, 0.0, 0.0), (0.0, 0.0, 0.0), -0.2),
-        ((10.0, 3.0, 4.0), (10.0, 0.0, 1.0), 4.0),  # from 5 m away to 1 m away
-        ((7.0, 4.0, 0.0), (7.0, -4.0, 0.0), 0.0),  # along a sphere about the gate
+        # progress is the decrease of the distance
+        (AHEAD, ORIGIN, {}, (pytest.approx(-0.2), pytest.approx(3.0))),
+        ((10.0, 3.0, 4.0), (10.0, 0.0, 1.0), {}, (pytest.approx(4.0), pytest.approx(3.0))),  # from 5 m away to 1 m
+        ((7.0, 4.0, 0.0), (7.0, -4.0, 0.0), {}, (pytest.approx(0.0), pytest.approx(3.0))),  # along a sphere
+        # a pass replaces progress and the rate term
+        (BEFORE, BEYOND, {"passes": 1}, (10.0, 0.0)),
+        # a crash outweighs everything, and hides lost numbers
+        (BEFORE, BEYOND, {"crashed": True}, (-4.0, 0.0)),
+        (BEFORE, BEYOND, {"passes": 1, "crashed": True}, (-4.0, 0.0)),
+        (ORIGIN, (math.nan, 0.0, math.inf), {"crashed": True, "rates": RATES * math.nan}, (-4.0, 0.0)),
+        # the rate term is left to the caller, so b₂ changes neither part
+        (ORIGIN, AHEAD, {"weights": OTHERS}, (pytest.approx(0.4), pytest.approx(3.0))),
+        (ORIGIN, AHEAD, {"weights": OTHERS, "passes": 1}, (7.0, 0.0)),
+        (ORIGIN, AHEAD, {"weights": OTHERS, "crashed": True}, (-1.0, 0.0)),
     ],
 )
-def test_progress_is_the_decrease_of_the_distance(previous, position, progress):
-    assert reward(previous, position) == (pytest.approx(progress), pytest.approx(3.0))
-
-
-def test_a_pass_replaces_progress_and_the_rate_term():
-    assert reward((9.9, 0.0, 0.0), (10.1, 0.0, 0.0), passes=1) == (10.0, 0.0)
-
-
-@pytest.mark.parametrize("passes", [0, 1])
-def test_a_crash_outweighs_everything(passes):
-    assert reward((9.9, 0.0, 0.0), (10.1, 0.0, 0.0), passes=passes, crashed=True) == (-4.0, 0.0)
-
-
-def test_a_crash_hides_lost_numbers():
-    lost = torch.full((1, 3), math.nan)
-    assert reward((0.0, 0.0, 0.0), (math.nan, 0.0, math.inf), crashed=True, rates=lost) == (-4.0, 0.0)
-
-
-def test_weights():
-    weights = RewardWeights(progress=2.0, body_rate=0.5, gate=7.0, collision=-1.0)
-    flight = ((0.0, 0.0, 0.0), (0.2, 0.0, 0.0))
-    # The rate term is left to the caller, so b₂ changes neither part.
-    assert reward(*flight, weights=weights) == (pytest.approx(0.4), pytest.approx(3.0))
-    assert reward(*flight, weights=weights, passes=1) == (7.0, 0.0)
-    assert reward(*flight, weights=weights, crashed=True) == (-1.0, 0.0)
+def test_one_step_is_rewarded(previous, position, given, expected):
+    case = {"weights": RewardWeights(), "rates": RATES, "passes": 0, "crashed": False, **given}
+    places, events = (torch.tensor([previous]), torch.tensor([position])), ("passes", "crashed")
+    parts = race_reward(case["weights"], GATE, *places, case["rates"], *(torch.tensor([case[it]]) for it in events))
+    assert tuple(part.item() for part in parts) == expected
 
 
 def test_drones_are_independent():

@@ -189,21 +189,19 @@ def test_absent_cuda_is_named(make: type, device: str) -> None:
         make("circle", device=device)
 
 
-def test_other_devices_are_refused() -> None:
-    for device in ("meta", "gpu"):
-        with pytest.raises(ValueError, match=f"device='{device}': must be cpu or cuda"):
-            DroneRacingEnv("circle", device=device)
-
-
-def test_unknown_backend_is_refused_with_the_known_ones() -> None:
-    with pytest.raises(ValueError, match="Unknown backend 'bullet': use auto, mujoco, mujoco_warp"):
-        RaceWorlds("circle", backend="bullet", from_pixels=False)
-
-
-@pytest.mark.parametrize("renderer", ["egl", "osmesa"])
-def test_a_renderer_the_backend_lacks_is_refused_by_name(renderer: str) -> None:
-    with pytest.raises(ValueError, match=rf"renderer='{renderer}'.*'mujoco_warp'.*renderer='auto' or 'warp'"):
-        RaceWorlds("circle", backend="mujoco_warp", renderer=renderer)
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        ({"device": "meta"}, "device='meta': must be cpu or cuda"),
+        ({"device": "gpu"}, "device='gpu': must be cpu or cuda"),
+        ({"backend": "bullet", "from_pixels": False}, "Unknown backend 'bullet': use auto, mujoco, mujoco_warp"),
+        *(({"backend": "mujoco_warp", "renderer": name},
+           rf"renderer='{name}'.*'mujoco_warp'.*renderer='auto' or 'warp'") for name in ("egl", "osmesa")),
+    ],
+)  # fmt: skip
+def test_what_the_backend_lacks_is_refused_by_name(arguments: dict[str, object], words: str) -> None:
+    with pytest.raises(ValueError, match=words):
+        RaceWorlds("circle", **arguments)
 
 
 def test_too_many_worlds_are_refused_before_anything_is_allocated(monkeypatch: pytest.MonkeyPatch) -> None:
