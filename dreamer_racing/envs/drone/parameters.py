@@ -30,7 +30,7 @@ from dreamer_racing.settings import (
 T = TypeVar("T")
 GRAVITY = 9.81  # m/s²
 INTEGRATORS = ("Euler", "RK4")
-"""MuJoCo's names of the allowed integrators: `RigidStep` corrects Euler to second order; RK4 needs no correction."""
+"""MuJoCo's names of the allowed integrators: `FusedFlight` corrects Euler to second order; RK4 needs no correction."""
 MOTOR_LAGS = ("speed", "thrust")
 """Quantity with first-order lag to its target: a rotor's speed, or its thrust, which is the square of the speed."""
 
