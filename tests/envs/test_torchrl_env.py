@@ -209,6 +209,15 @@ def test_wrong_actions_are_explained(action: torch.Tensor, error: type[Exception
         env.step(data.set("action", action))
 
 
+def test_actions_beyond_the_bounds_are_clipped() -> None:
+    ends = []
+    for scale in (1.0, 7.0):
+        env = blind(evaluation=True)
+        data = env.reset().set("action", scale * torch.tensor([[1.0, -1.0, 1.0, 1.0]]).repeat(3, 1))
+        ends.append(env.step(data)["next", "privileged", "attitude"])
+    assert torch.equal(*ends)
+
+
 def test_collector_resets_by_itself() -> None:
     env = DroneRacingEnv("circle", 4, seed=0, episode_steps=5)
     collector = Collector(env, hover, frames_per_batch=48, total_frames=96)
