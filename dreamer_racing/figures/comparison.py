@@ -13,7 +13,7 @@ import numpy as np
 
 from dreamer_racing.figures.curves import ENDS_EARLY, QUANTITIES
 from dreamer_racing.figures.runs import AXES, REFERENCE, CurveKey, RunData, along, axis_of, group_runs
-from dreamer_racing.training.clock import WALL_CLOCK
+from dreamer_racing.training.metrics import WALL_CLOCK
 
 LAST_SHARE = 0.2  # length of the final window in which variants are compared, as a share of its end
 COMPARED = ("gates", "success_rate", "evaluation_return", "image_error")  # names in `QUANTITIES`

@@ -19,9 +19,8 @@ import yaml
 
 from dreamer_racing.envs.tracks.loading import BUILTIN_TRACKS
 from dreamer_racing.settings import check_choice
-from dreamer_racing.training.clock import CPU_CLOCK, WALL_CLOCK
 from dreamer_racing.training.directory import RunDirectory
-from dreamer_racing.training.metrics import MetricsTable, read_metrics
+from dreamer_racing.training.metrics import CPU_CLOCK, WALL_CLOCK, MetricsTable, read_metrics
 
 DEFAULT_ALGORITHM = "dreamer_v3"  # for configurations without `algorithm`
 LOGGED_BY = (

@@ -1,9 +1,4 @@
-"""Checkpoints of a run: crash-safe saving and restoring.
-
-A checkpoint is a folder ``<run_dir>/checkpoints/checkpoint-<env_steps>`` in the format of `torchrl.checkpoint`. It is
-written under another name and then renamed, so that a folder of that name is always complete; what a killed process
-leaves behind has a name with a leading dot, is never read, and is removed by the next run. The CRC-32 of every file is
-stored in the checkpoint and compared before anything is read.
+"""Checkpoints of a run: crash-safe saving and restoring of folders in the format of `torchrl.checkpoint`.
 
 If several processes train together (`parallel`), a checkpoint holds the state of all of them: rank 0 writes its parts
 as a single process does, and each other process writes its own parts (environments, replay, random state) below
@@ -16,13 +11,16 @@ from __future__ import annotations
 import logging
 import shutil
 from collections.abc import Callable, Collection, Mapping
+from dataclasses import dataclass
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import torch
 from torchrl.checkpoint import Checkpoint, CheckpointError, GlobalRNGState, StateDictCheckpointAdapter
 
 from dreamer_racing import parallel
+from dreamer_racing.settings import COUNT, NOT_NEGATIVE, setting
 from dreamer_racing.training.directory import (
     PREFIX,
     PROCESS,
@@ -36,6 +34,27 @@ from dreamer_racing.training.directory import (
 from dreamer_racing.training.publishing import damage_of, publish, remove, remove_unfinished
 
 logger = logging.getLogger(__name__)
+
+
+@dataclass
+class CheckpointConfig:
+    """Checkpoints during training."""
+
+    every: int = setting(50_000, NOT_NEGATIVE)  # env_steps between checkpoints
+    # minutes of wall-clock time between checkpoints, for preemptible machines; 0: by env_steps alone
+    minutes: float = setting(0.0, NOT_NEGATIVE)
+    keep: int = setting(2, COUNT)  # number of newest checkpoints kept
+
+    def disk_needed(self, replay: int, directory: RunDirectory) -> str:
+        """Return a line on the peak disk use of checkpoints with a replay of so many bytes, and on the free space."""
+        there = sum(file.stat().st_size for file in directory.checkpoints.rglob("*") if file.is_file())
+        peak, free = (self.keep + 1) * replay, shutil.disk_usage(directory.path).free + there
+        line = (
+            f"disk: at most {peak / 1e9:.1f} GB for the replay in checkpoint.keep={self.keep} checkpoints and the one "
+            f"being written, about a seventh of that for images of races; {free / 1e9:.1f} GB free"
+        )
+        advice = "lower checkpoint.keep= or replay.capacity=, or choose another run_dir=; else saving may fail"
+        return f"{line}: MAY NOT BE ENOUGH, {advice}" if peak > free else line
 
 
 class RunCheckpointError(CheckpointError, ValueError):
@@ -67,10 +86,8 @@ class RunCheckpoints:
     plain Python values (learner, optimiser, curriculum), or is a dictionary of JSON values, restored in place
     (counters). The random state of Python, NumPy and torch is always saved, too, as the part ``random_state``.
 
-    Only one run at a time may write to a run directory.
-
     Args:
-        run_dir: Folder of the run; checkpoints go to its subfolder ``checkpoints``.
+        run_dir: Folder of the run; checkpoints go to ``checkpoints/checkpoint-<env_steps>`` below it.
         components: Parts by name.
         keep_last: Number of checkpoints kept.
         own: Names of the parts that differ between processes, besides the random state; if there are any, all processes
@@ -98,17 +115,10 @@ class RunCheckpoints:
             remove_unfinished(self.directory)
 
     def save(self, env_steps: int, metadata: Mapping[str, Any] | None = None) -> Path:
-        """Save all parts, and remove the oldest checkpoints beyond ``keep_last``.
+        """Save all parts with JSON ``metadata``, remove the oldest checkpoints beyond ``keep_last``, return the folder.
 
         Checkpoints with more ``env_steps`` are removed, too: they belong to the run that this one replaces, because it
         was resumed from an earlier checkpoint. A second save at the same ``env_steps`` does nothing.
-
-        Args:
-            env_steps: Control steps summed over environments; part of the checkpoint's name.
-            metadata: JSON values to store in the manifest.
-
-        Returns:
-            The checkpoint's folder.
 
         Raises:
             RunCheckpointError: if it cannot be written; the previous checkpoints are untouched.
@@ -120,9 +130,10 @@ class RunCheckpoints:
         processes = {PROCESSES: parallel.num_processes()} if self._own and parallel.num_processes() > 1 else {}
         about = {**(metadata or {}), "env_steps": env_steps, **processes}
         first = parallel.is_first()
+        own = _bind({**self._own, "random_state": RandomState()})
         try:
             self._step(lambda: self._checkpoint.save(partial, metadata=about), of_this_process=first)
-            self._step(lambda: self._save_own(partial), of_this_process=not first)
+            self._step(lambda: own.save(partial / f"{PROCESS}{parallel.rank()}"), of_this_process=not first)
             self._step(lambda: publish(partial, final), of_this_process=first)
         except Exception as error:
             if first:
@@ -147,12 +158,8 @@ class RunCheckpoints:
         else:
             action()
 
-    def _save_own(self, checkpoint: Path) -> None:
-        """Save this process's own parts into the checkpoint that rank 0 has begun."""
-        _bind({**self._own, "random_state": RandomState()}).save(checkpoint / f"{PROCESS}{parallel.rank()}")
-
     def load(self, path: str | Path | None = None, may_lack: Collection[str] = ()) -> dict[str, Any]:
-        """Restore all parts.
+        """Restore all parts; return the metadata of the checkpoint, with ``env_steps``.
 
         If a checkpoint is damaged, the one before it is restored; what is lost is logged.
 
@@ -160,19 +167,16 @@ class RunCheckpoints:
             path: Run directory, folder of checkpoints, or one checkpoint; this run's latest if None.
             may_lack: Parts that the checkpoint may lack; they are left as they are then.
 
-        Returns:
-            The metadata of the checkpoint, with ``env_steps``.
-
         Raises:
             FileNotFoundError: if there is no complete checkpoint.
             RunCheckpointError: if all are damaged, or a part is missing or does not fit.
         """
         self._last_saved = None
+        path = self.directory if path is None else path
         parts = {**self.components, "random_state": RandomState()}
         if not self._own:
-            return load_components(self.directory if path is None else path, parts, may_lack)
-        looked_at = {*parts, *self._own_names}
-        found = str(newest_sound(self.directory if path is None else path, looked_at)) if parallel.is_first() else ""
+            return load_components(path, parts, may_lack)
+        found = str(newest_sound(path, {*parts, *self._own_names})) if parallel.is_first() else ""
         source = Path(parallel.broadcast(found))
         metadata = Checkpoint.manifest(source)["metadata"]
         own = {name: part for name, part in parts.items() if name in self._own or name == "random_state"}
@@ -187,10 +191,7 @@ class RunCheckpoints:
         return metadata
 
     def _redistribute(self, source: Path, saved: int) -> None:
-        """Redistribute the streams of replays that another number of processes saved.
-
-        Streams are ordered by descending rank, so that rank 0 gets the last ones, which may be held out.
-        """
+        """Redistribute replay streams by descending rank, so that rank 0 gets the last ones, which may be held out."""
         for name, part in self._own.items():
             if not hasattr(part, "load_shards"):
                 continue
@@ -220,16 +221,10 @@ class RunCheckpoints:
 
 
 class BestCheckpoint:
-    """Keeps the parts as they were at the best evaluation so far, below ``<run_dir>/best``.
+    """Keeps the parts as they were at the best evaluation so far, of ``score``, below ``<run_dir>/best``.
 
-    Args:
-        run_dir: Folder of the run.
-        components: As for `RunCheckpoints`.
-        env_steps: env_steps at which the run starts or resumes. A best checkpoint of later env_steps belongs to a part
-            of the run that is now repeated: it is moved to ``<run_dir>/best.replaced``.
-
-    Attributes:
-        score: Score of the evaluation whose parts are kept; None before the first.
+    A best checkpoint of more ``env_steps`` than those at which the run starts or resumes belongs to a part of the run
+    that is now repeated: it is moved to ``<run_dir>/best.replaced``.
     """
 
     def __init__(self, run_dir: str | Path, components: Mapping[str, Any], env_steps: int) -> None:
@@ -267,10 +262,7 @@ class BestCheckpoint:
 
 
 def load_components(path: str | Path, components: Mapping[str, Any], may_lack: Collection[str] = ()) -> dict[str, Any]:
-    """Restore some parts of a checkpoint, for example ``{"learner": learner}`` for an evaluation.
-
-    Arguments, returned metadata and errors are those of `RunCheckpoints.load`.
-    """
+    """Restore some parts of a checkpoint, for example ``{"learner": learner}``, as `RunCheckpoints.load` does."""
     return _restore(newest_sound(path, components), components, may_lack)
 
 
@@ -300,31 +292,15 @@ def newest_sound(path: str | Path, parts: Collection[str] | None = None) -> Path
 
 
 def load_state(path: str | Path, part: str) -> tuple[dict[str, Any], dict[str, Any]]:
-    """Return the saved state of one part of a checkpoint, without an object to restore.
-
-    Returns:
-        The state, and the metadata of the checkpoint, with ``env_steps``.
+    """Return the saved state of one part of a checkpoint, and the checkpoint's metadata with ``env_steps``.
 
     Raises:
         FileNotFoundError: if there is no complete checkpoint.
         RunCheckpointError: if it has no such part, or all are damaged.
     """
-    state = _PlainState()
-    metadata = load_components(path, {part: state})
-    return dict(state.value), metadata
-
-
-class _PlainState:
-    """Stand-in for a part that keeps its saved state as it is."""
-
-    def __init__(self) -> None:
-        self.value: Mapping[str, Any] = {}
-
-    def state_dict(self) -> Mapping[str, Any]:
-        return self.value
-
-    def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        self.value = state
+    loaded: list[Mapping[str, Any]] = []
+    metadata = load_components(path, {part: SimpleNamespace(state_dict=dict, load_state_dict=loaded.append)})
+    return dict(loaded[0]), metadata
 
 
 def _bind(components: Mapping[str, Any]) -> Checkpoint:

@@ -93,12 +93,7 @@ class RunDirectory:
         return self.path / "replay" / f"{PROCESS}{parallel.rank()}"
 
     def claim(self) -> RunLock:
-        """Create the folder if needed, and lock it for this process.
-
-        Raises:
-            PermissionError: The folder is not writable.
-            ValueError: A live run holds its lock.
-        """
+        """Create the folder if needed, and lock it; see `ensure_writable` and `RunLock`."""
         made = not self.path.exists()
         return RunLock(ensure_writable(self.path), made)
 
@@ -127,21 +122,17 @@ class RunDirectory:
         They belong to a part of the run that is now repeated, perhaps with other results.
         """
         moved: set[int] = set()
-        for folder in (self.evaluations, self.plots, self.videos):
-            for file in folder.glob("*"):
-                number = file.stem.partition("_")[0]
-                if number.isdecimal() and int(number) > env_steps:
-                    aside = folder.with_name(folder.name + REPLACED)
-                    aside.mkdir(exist_ok=True)
-                    file.replace(aside / file.name)
-                    moved.add(int(number))
+        for file in (file for folder in (self.evaluations, self.plots, self.videos) for file in folder.glob("*")):
+            number = file.stem.partition("_")[0]
+            if number.isdecimal() and int(number) > env_steps:
+                aside = file.parent.with_name(file.parent.name + REPLACED)
+                aside.mkdir(exist_ok=True)
+                file.replace(aside / file.name)
+                moved.add(int(number))
         if moved:
-            logger.warning(
-                "evaluations at %s env_steps are later than the resumed checkpoint: their files are in *%s of %s",
-                ", ".join(f"{number:,}" for number in sorted(moved)),
-                REPLACED,
-                self.path,
-            )
+            numbers = ", ".join(f"{number:,}" for number in sorted(moved))
+            later = "evaluations at %s env_steps are later than the resumed checkpoint: their files are in *%s of %s"
+            logger.warning(later, numbers, REPLACED, self.path)
 
     def note_start(self, env_steps: int, overrides: Sequence[str], commit: str | None) -> None:
         """Append a start or resume of the run at ``env_steps``, with its overrides and commit, to `starts`."""
@@ -150,11 +141,8 @@ class RunDirectory:
             file.write(json.dumps({"date": f"{datetime.now(UTC):%Y-%m-%d %H:%M}", **line}) + "\n")
 
     def read_starts(self) -> list[dict[str, Any]]:
-        """Return all recorded starts; runs of older versions have none."""
-        try:
-            lines = self.starts.read_text(encoding="utf-8").splitlines(keepends=True)
-        except FileNotFoundError:
-            return []
+        """Return all recorded starts."""
+        lines = self.starts.read_text(encoding="utf-8").splitlines(keepends=True) if self.starts.exists() else []
         starts = []
         for line in lines:
             try:
@@ -166,12 +154,9 @@ class RunDirectory:
 
 
 def complete_checkpoints(path: str | Path) -> list[Path]:
-    """Return the complete checkpoints, newest first; incomplete folders of a killed process are skipped.
+    """Return the complete checkpoints of a run directory or a folder of checkpoints, newest first, or the one named.
 
     A checkpoint that was renamed for a replacement that was never completed is included.
-
-    Args:
-        path: Run directory, folder of checkpoints, or one checkpoint.
 
     Raises:
         FileNotFoundError: If there is none.
@@ -214,7 +199,7 @@ def env_steps_of(checkpoint: Path) -> int:
 
 
 def latest_checkpoint(path: str | Path) -> Path:
-    """Return the newest complete checkpoint; see ``complete_checkpoints``."""
+    """Return the newest complete checkpoint; see `complete_checkpoints`."""
     return complete_checkpoints(path)[0]
 
 
@@ -275,14 +260,10 @@ def fresh_directory(path: str | Path, result: str) -> Path:
 
 
 class RunLock:
-    """Lock of a run directory, held until `release` or the end of the process.
+    """Lock of an existing run directory, which may have been ``made`` for it, until `release` or the process's end.
 
     It works across machines if the file system's locks do (NFS 4, Lustre with flock); without any locks it only logs a
     warning.
-
-    Args:
-        directory: Existing run directory.
-        made: Whether the directory was created for this lock.
 
     Raises:
         ValueError: A live process holds the lock; the message names it.

@@ -18,8 +18,7 @@ MEMORY = 200
 KNOWN_PASS_RATE = 0.4
 """Pass rate of the gate with the lowest one above which the whole lap counts as known [choice]."""
 MIN_PROGRESS_RATE = 3.0
-"""Minimum increase of `GatePassRate.progress` per length of the run, once the lap is known [choice]: 0.4 in 200,000 of
-1,500,000 env_steps."""
+"""Minimum increase of `GatePassRate.progress` per length of the run, once the lap is known [choice]."""
 
 
 class EpisodeTracker:
@@ -47,11 +46,7 @@ class EpisodeTracker:
         self._length = torch.zeros(num_envs, dtype=torch.int64)  # (N,)
 
     def update(self, rollout: TensorDictBase) -> TensorDictBase:
-        """Add one rollout, and return the episodes that ended in it.
-
-        Args:
-            rollout: Batch ``[N, T]`` with ``("next", "reward")``, ``("next", "done")`` and optionally
-                ``("next", "truncated")``, ``("next", "race", ...)`` and the root's ``is_init``.
+        """Add one rollout ``[N, T]``, and return the episodes that ended in it.
 
         Returns:
             Finished episodes, batch ``[E]``, on the CPU, in the order in which they ended: ``env`` int64, ``return``
@@ -61,7 +56,10 @@ class EpisodeTracker:
         """
         reward = rollout["next", "reward"].squeeze(-1).cpu().double()  # (N, T)
         done = rollout["next", "done"].squeeze(-1).cpu()
-        self._forget_interrupted(rollout)
+        if (is_init := rollout.get("is_init", None)) is not None:
+            began = is_init[:, 0].reshape(-1).cpu()  # also if reset between rollouts, for example at a resume
+            self._return[began] = 0
+            self._length[began] = 0
         # Sums over the rollout, plus those that the unfinished episode brings from earlier rollouts.
         returned = self._return.unsqueeze(-1) + reward.cumsum(-1)  # (N, T)
         lasted = self._length.unsqueeze(-1) + torch.arange(1, done.shape[-1] + 1)
@@ -74,7 +72,10 @@ class EpisodeTracker:
         )
         self._carry(returned, lasted, env, step)
         order = torch.argsort(step, stable=True)
-        episodes = {"env": env, "return": returns.float(), "length": lengths, **self._facts(rollout, env, step)}
+        found = {name: rollout["next"].get(("race", name), None) for name in self._FACTS}
+        found["truncated"] = rollout["next"].get("truncated", None)
+        facts = {name: value.squeeze(-1).cpu()[env, step] for name, value in found.items() if value is not None}
+        episodes = {"env": env, "return": returns.float(), "length": lengths, **facts}
         return TensorDict(episodes, batch_size=[len(env)])[order]
 
     def summary(self, episodes: TensorDictBase) -> dict[str, float]:
@@ -97,14 +98,6 @@ class EpisodeTracker:
         self._return = state_dict["return"].clone()
         self._length = state_dict["length"].clone()
 
-    def _forget_interrupted(self, rollout: TensorDictBase) -> None:
-        """Drop unfinished episodes of environments that were reset between rollouts, for example at a resume."""
-        is_init = rollout.get("is_init", None)
-        if is_init is not None:
-            began = is_init[:, 0].reshape(-1).cpu()
-            self._return[began] = 0
-            self._length[began] = 0
-
     def _carry(self, returned: Tensor, lasted: Tensor, env: Tensor, step: Tensor) -> None:
         """Keep the sums since each environment's last episode end."""
         last = torch.full((len(returned),), -1).scatter_reduce(0, env, step, "amax")  # (N,) −1: none ended
@@ -114,21 +107,13 @@ class EpisodeTracker:
             for values in (returned, lasted)
         )
 
-    def _facts(self, rollout: TensorDictBase, env: Tensor, step: Tensor) -> dict[str, Tensor]:
-        found = {name: rollout["next"].get(("race", name), None) for name in self._FACTS}
-        found["truncated"] = rollout["next"].get("truncated", None)
-        return {name: value.squeeze(-1).cpu()[env, step] for name, value in found.items() if value is not None}
-
 
 class GatePassRate:
-    """Pass rate of each gate of a track, among attempts that come from the gate before, and the lowest of these rates.
+    """Pass rate of each of a track's G gates, among attempts from the gate before, and the lowest of these rates.
 
     The lowest rate tells whether a whole lap is known; a mean would be high even if one gate was never passed. An
     episode's first gate does not count, because training may start right before it. An episode that runs out of time
-    has failed at no gate.
-
-    Args:
-        num_gates: G, number of gates of the track; 0 without a race, when the rate stays 0.
+    has failed at no gate. Without a race G is 0, and the rate stays 0.
 
     Attributes:
         best: Highest value of the lowest rate since the decayed number of attempts of each gate reached half of
@@ -202,12 +187,8 @@ class GatePassRate:
 
     def state_dict(self) -> dict[str, Any]:
         """Return everything that a checkpoint needs."""
-        return {
-            "best": self.best,
-            "known_since": self.known_since,
-            "passes": self._passes.clone(),
-            "attempts": self._attempts.clone(),
-        }
+        tensors = {"passes": self._passes.clone(), "attempts": self._attempts.clone()}
+        return {"best": self.best, "known_since": self.known_since, **tensors}
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
         """Restore what `state_dict` returned."""

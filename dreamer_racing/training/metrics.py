@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import csv
+import io
+import itertools
 import logging
+import math
 import os
 from collections import defaultdict
 from collections.abc import Collection, Iterable, Mapping, Sequence
@@ -17,10 +20,10 @@ from torch import Tensor
 from torchrl.record.loggers import Logger
 
 from dreamer_racing.settings import quoted
-from dreamer_racing.training.directory import RunDirectory
+from dreamer_racing.training.directory import RunDirectory, replace_text
 
 logger = logging.getLogger(__name__)
-X_AXIS = "env_steps"
+X_AXIS, WALL_CLOCK, CPU_CLOCK = "env_steps", "wall_clock", "cpu_clock"
 MOST_DIGITS = 19
 """Maximum number of digits of env_steps; a longer number is damaged, and Python's int() reads only some thousands."""
 
@@ -37,12 +40,12 @@ class MetricsLog:
         loggers: TorchRL loggers that also receive every row (`dreamer_racing.figures.loggers` makes some).
         resume_env_steps: env_steps of the last row that a resumed run keeps: later rows are removed. If None, the run
             is new, and an existing ``metrics.csv`` is kept under another name.
-        pending: Metrics that are not yet written, to be saved with the run; None for a new run.
+        pending: Metrics that are not yet written, to be saved with the run.
 
     Example:
-        >>> with MetricsLog("runs/example") as metrics:  # doctest: +SKIP
-        ...     metrics.push({"loss/actor": torch.tensor(1.0)})
-        ...     metrics.write(env_steps=1024)
+        >>> metrics = MetricsLog("runs/example")  # doctest: +SKIP
+        >>> metrics.push({"loss/actor": torch.tensor(1.0)})  # doctest: +SKIP
+        >>> metrics.write(env_steps=1024)  # doctest: +SKIP
     """
 
     def __init__(
@@ -50,13 +53,13 @@ class MetricsLog:
         run_dir: str | Path,
         loggers: Sequence[Logger] = (),
         resume_env_steps: int | None = None,
-        pending: PendingMetrics | None = None,
+        pending: Journal | None = None,
     ) -> None:
         run_dir = Path(run_dir)
         run_dir.mkdir(parents=True, exist_ok=True)
         self.path = RunDirectory(run_dir).metrics
         self.loggers = list(loggers)
-        self._pending = pending or PendingMetrics()
+        self._pending = pending or Journal()
         self._columns = [X_AXIS]
         if resume_env_steps is None:
             _keep_aside(self.path)
@@ -65,11 +68,9 @@ class MetricsLog:
             self._truncate(resume_env_steps)
 
     def push(self, metrics: Mapping[str, Tensor | float], count: int = 1) -> None:
-        """Add values to the averages; tensors stay on their device, so nothing waits for it.
+        """Add values by name, each the mean of ``count``, to the averages; tensors stay on their device, so none waits.
 
-        Args:
-            metrics: Values by name; a tensor with several elements is averaged.
-            count: Weight of each value: the number of values that it is the mean of.
+        A tensor with several elements is averaged.
         """
         self._pending.averages.push(metrics, count)
 
@@ -140,12 +141,6 @@ class MetricsLog:
                     except OSError as error:
                         logger.warning("The last metrics sent to %s may be lost: %s.", type(sink).__name__, error)
 
-    def __enter__(self) -> MetricsLog:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.close()
-
     def _truncate(self, env_steps: int) -> None:
         rows = _read_rows(self.path) if self.path.exists() else []
         kept = [row for row in rows if int(row[X_AXIS]) <= env_steps]
@@ -172,67 +167,62 @@ class MetricsLog:
     def _rewrite(self, rows: Iterable[Mapping[str, str]], new_columns: Sequence[str]) -> None:
         """Replace the file by one with these rows and additional columns."""
         columns = [*self._columns, *new_columns]
-        partial = self.path.with_name(f".{self.path.name}.partial")
-        with partial.open("w", newline="", encoding="utf-8") as file:
-            writer = csv.DictWriter(file, columns, restval="")
-            writer.writeheader()
-            writer.writerows(rows)
-            file.flush()
-            os.fsync(file.fileno())
-        os.replace(partial, self.path)
+        content = io.StringIO(newline="")
+        writer = csv.DictWriter(content, columns, restval="")
+        writer.writeheader()
+        writer.writerows(rows)
+        replace_text(self.path, content.getvalue())
         self._columns = columns
 
 
-class PendingMetrics:
-    """Metrics of a run that are not yet in the file, and the position of the file.
+class Journal:
+    """What a resumed run needs to write the same rows: metrics not yet in the file, and when actions were last due.
 
     Attributes:
         averages: Averages of the metrics pushed since the latest row.
         rows: env_steps and values of rows that are not yet written.
         written: env_steps of the latest row in the file; 0 before the first.
+        latest: env_steps at which each periodic action was last due, restored in place.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, latest: dict[str, int] | None = None) -> None:
         self.averages = RunningMean()
         self.rows: list[tuple[int, dict[str, float]]] = []
         self.written = 0
+        self.latest = {} if latest is None else latest
 
     def state_dict(self) -> dict[str, Any]:
         """Return everything that a checkpoint needs."""
-        return {"averages": self.averages.state_dict(), "rows": list(self.rows), "written": self.written}
+        averages = self.averages.state_dict()
+        return {"latest": dict(self.latest), "averages": averages, "rows": list(self.rows), "written": self.written}
 
     def load_state_dict(self, state_dict: Mapping[str, Any]) -> None:
         """Restore what `state_dict` returned."""
         self.averages.load_state_dict(state_dict["averages"])
         self.rows, self.written = list(state_dict["rows"]), state_dict["written"]
+        self.latest.update(state_dict["latest"])
 
 
 def _read_rows(path: Path) -> list[dict[str, str]]:
     """Read the complete rows; skip those without a number of env_steps, and log that."""
     header, cells, _ = read_rows(path)
     rows = [dict(zip(header, row, strict=True)) for row in cells]
-    damaged = [row[X_AXIS] for row in rows if not _is_count(row[X_AXIS])]
+    steps = [row[X_AXIS] for row in rows]
+    damaged = [cell for cell in steps if not (cell.isascii() and cell.isdigit() and len(cell) < MOST_DIGITS)]
     if damaged:
         logger.warning(
             "%s is damaged: %s is not a number of env_steps. %d of %d rows are ignored.",
             path, quoted(damaged[0]), len(damaged), len(rows),
         )  # fmt: skip
-    return [row for row in rows if _is_count(row[X_AXIS])]
-
-
-def _is_count(cell: str) -> bool:
-    """Return whether a cell is a whole number in the format of this file."""
-    return cell.isascii() and cell.isdigit() and len(cell) < MOST_DIGITS
+    return [row for row in rows if row[X_AXIS] not in damaged]
 
 
 def _keep_aside(path: Path) -> None:
-    if not path.exists():
-        return
-    number = 1
-    while (other := path.with_name(f"{path.stem}.{number}{path.suffix}")).exists():
-        number += 1
-    logger.warning("%s belongs to an earlier run and is kept as %s.", path, other.name)
-    os.replace(path, other)
+    if path.exists():
+        names = (path.with_name(f"{path.stem}.{number}{path.suffix}") for number in itertools.count(1))
+        other = next(name for name in names if not name.exists())
+        logger.warning("%s belongs to an earlier run and is kept as %s.", path, other.name)
+        os.replace(path, other)
 
 
 class RunningMean:
@@ -302,10 +292,9 @@ class MetricsTable:
 
 
 def read_rows(path: Path) -> tuple[list[str], list[list[str]], list[str]]:
-    """Read the complete rows; the last one may be truncated by a kill, or still being written.
+    """Return the header, the rows with as many cells as it has, and descriptions of what was left out.
 
-    Returns:
-        The header, the rows with as many cells as it has, and descriptions of what was left out.
+    The last row may be truncated by a kill, or still being written.
 
     Raises:
         ValueError: The file is not a table of metrics.
@@ -338,7 +327,7 @@ def read_metrics(path: str | Path, wanted: Collection[str] | None = None) -> Met
     header, rows, problems = read_rows(Path(path))
     if not rows:
         raise ValueError(f"{path} has no rows: nothing was logged yet.")
-    steps = _numbers([row[header.index(X_AXIS)] for row in rows])
+    steps = np.array([_number(row[header.index(X_AXIS)]) for row in rows])
     order = np.argsort(steps, kind="stable")[: np.isfinite(steps).sum()]  # NaN sorts last
     if len(order) < len(rows):
         problems.append(f"{len(rows) - len(order)} of {len(rows)} rows have no number of env_steps")
@@ -347,8 +336,8 @@ def read_metrics(path: str | Path, wanted: Collection[str] | None = None) -> Met
         if name == X_AXIS or (wanted is not None and name not in wanted):
             continue
         cells = [row[index] for row in rows]
-        values = _numbers(cells)
-        unreadable += sum(not _is_number(cells[i]) for i in np.flatnonzero(np.isnan(values)))
+        values = np.array([_number(cell) for cell in cells])
+        unreadable += sum(cells[i].lower() not in ("", "nan") for i in np.flatnonzero(np.isnan(values)))
         kept = order[np.isfinite(values[order])]
         if len(kept):
             columns[name] = (steps[kept], values[kept])
@@ -357,18 +346,9 @@ def read_metrics(path: str | Path, wanted: Collection[str] | None = None) -> Met
     return MetricsTable(columns, steps[order], problems)
 
 
-def _numbers(cells: list[str]) -> np.ndarray:
-    """Parse cells to numbers (R,); empty and unreadable ones become NaN."""
+def _number(cell: str) -> float:
+    """Parse a cell; an empty or unreadable one becomes NaN."""
     try:
-        return np.array([float(cell) if cell else np.nan for cell in cells])
+        return float(cell)
     except ValueError:
-        return np.array([float(cell) if cell and _is_number(cell) else np.nan for cell in cells])
-
-
-def _is_number(cell: str) -> bool:
-    """Return whether a cell is a number or empty."""
-    try:
-        float(cell or "nan")
-    except ValueError:
-        return False
-    return True
+        return math.nan

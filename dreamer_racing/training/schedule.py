@@ -1,7 +1,4 @@
-"""Schedules of hyperparameters, the replay ratio, and the check whether the policy should wait for its world model.
-
-Scheduled hyperparameters change with the run's env_steps or with the policy's gate pass rate.
-"""
+"""Schedules of hyperparameters, the replay ratio, and the check whether the policy should wait for its world model."""
 
 from __future__ import annotations
 
@@ -10,7 +7,7 @@ import math
 import statistics
 from collections import deque
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from enum import Enum
 from itertools import product
 from typing import Any
@@ -30,8 +27,7 @@ ERRORS = ("privileged_error", "image_error", "loss_vector", "reward_error")
 MEDIAN_WINDOW = 5
 """Number of latest measurements whose median is used, so that a single unusual flight does not count [choice]."""
 PATIENCE = 10
-"""Maximum number of measurements that a policy waits; it waits again only after the ratio fell below the limit
-[choice]."""
+"""Measurements that a policy waits at most; it waits again only after the ratio fell below the limit [choice]."""
 
 
 class RampClock(Enum):
@@ -64,11 +60,7 @@ class Ramp:
     by: RampClock = RampClock.run
 
     def check(self, name: str) -> None:
-        """Check that 0 <= begin <= end <= 1.
-
-        Raises:
-            ValueError: It is not so; the message gives name and both ends.
-        """
+        """Raise ``ValueError`` unless 0 <= begin <= end <= 1."""
         if not 0.0 <= self.begin <= self.end <= 1.0:
             raise ValueError(f"{name}: begin={self.begin} and end={self.end} must satisfy 0 <= begin <= end <= 1.")
 
@@ -114,7 +106,7 @@ class ScheduleConfig:
             suite: Environment suite; only races have gates.
 
         Raises:
-            ValueError: The message names the ramp.
+            ValueError: They are not; the message names the ramp.
         """
         for name, ramp in self.ramps.items():
             ramp.check(f"schedule.{name}")
@@ -134,19 +126,15 @@ class ScheduleConfig:
             raise ValueError("schedule.start_on_line starts from env.start_on_line=0: set that above 0.")
 
     def check_deviations(self, loss: Any) -> None:
-        """Check that ``min_std`` stays below ``max_std`` during the ramps of both.
+        """Raise ``ValueError`` unless ``min_std`` stays below ``max_std`` during the ramps of both.
 
         If both ramps have the same clock and times, the bounds are compared at begin and end, else in all combinations.
-
-        Raises:
-            ValueError: It does not; the message names both settings.
         """
-        ramps = {"min_std": self.min_std, "max_std": self.max_std}
-        lowest, highest = (
-            [(f"loss.{name}", getattr(loss, name)), (f"schedule.{name}.to", ramp.to)] for name, ramp in ramps.items()
-        )
-        together = len({(ramp.begin, ramp.end, ramp.by) for ramp in ramps.values()}) == 1
-        moving = all(ramp.to is not None for ramp in ramps.values())
+        low_ramp, high_ramp = self.min_std, self.max_std
+        lowest = [("loss.min_std", loss.min_std), ("schedule.min_std.to", low_ramp.to)]
+        highest = [("loss.max_std", loss.max_std), ("schedule.max_std.to", high_ramp.to)]
+        together = replace(low_ramp, to=None) == replace(high_ramp, to=None)
+        moving = low_ramp.to is not None and high_ramp.to is not None
         pairs = zip(lowest, highest, strict=True) if together and moving else product(lowest, highest)
         for (low, least), (high, most) in pairs:
             if least is not None and most is not None and least >= most:
@@ -203,13 +191,13 @@ def owner_of(name: str, owners: Mapping[str, Any]) -> Any:
 
 
 class Schedule:
-    """Computes the scheduled values of hyperparameters over a run.
+    """Computes the scheduled values of hyperparameters over a run, by its length or by the gate pass rate.
 
     Args:
         config: Ramps.
         owners: As for `ScheduleConfig.check`.
         total_env_steps: Length of the run.
-        num_gates: Number of gates of the track; 0 without a race, when no ramp may depend on gates.
+        num_gates: Number of gates of the track; 0 without a race.
 
     Example:
         >>> from dreamer_racing.losses import LossConfig
@@ -259,12 +247,8 @@ class Schedule:
 class ReplayRatio:
     """Computes the number of updates due from the replay ratio, the records trained on per environment step.
 
-    If a run is resumed with another ratio, the updates due before that point still follow the old one.
-
-    Args:
-        ratio: Records trained on per environment step after the prefill.
-        records: Records per update.
-        prefill: env_steps collected before the first update.
+    If a run is resumed with another ratio, the updates due before that point still follow the old one. An update
+    trains on ``records``; the first follows ``prefill`` env_steps.
 
     Example:
         >>> ratio = ReplayRatio(ratio=4.0, records=64, prefill=100)
@@ -289,14 +273,8 @@ class ReplayRatio:
 
     def state_dict(self) -> dict[str, Any]:
         """Return the ratio, since when it applies, and the latest env_steps."""
-        return {
-            "ratio": self.ratio,
-            "records": self.records,
-            "prefill": self.prefill,
-            "since": self._since,
-            "before": self._before,
-            "env_steps": self._env_steps,
-        }
+        numbers = {"ratio": self.ratio, "records": self.records, "prefill": self.prefill}
+        return {**numbers, "since": self._since, "before": self._before, "env_steps": self._env_steps}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Restore what `state_dict` returned; if the ratio has changed, log it, and apply the new one from here on."""
@@ -315,9 +293,7 @@ class ModelLag:
 
     A policy that improves faster than its model reaches states where the model is wrong, and exploits the errors that
     promise the most reward. Then the error on the newest records exceeds that in training, and the policy should wait.
-
-    The newest records are those of all environments: those of a single held-out one vary too much from flight to
-    flight. While flights get faster, new records are harder than old ones, so a ratio slightly above 1 is no lag.
+    While flights get faster, new records are harder than old ones, so a ratio slightly above 1 is no lag.
 
     Args:
         limit: Ratio of these errors above which the policy waits; None turns the measurement off.
@@ -383,13 +359,8 @@ class ModelLag:
 
     def state_dict(self) -> dict[str, Any]:
         """Return everything that a checkpoint needs."""
-        return {
-            "periods": self._periods,
-            "sum": float(self._sum),
-            "count": self._count,
-            "ratios": list(self._ratios),
-            "above": self._above,
-        }
+        errors = {"sum": float(self._sum), "count": self._count, "ratios": list(self._ratios)}
+        return {"periods": self._periods, **errors, "above": self._above}
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
         """Restore what ``state_dict`` returned."""

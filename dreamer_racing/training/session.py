@@ -1,7 +1,4 @@
-"""Training session: everything around the loop of a recipe.
-
-The recipe has the loop that collects and learns. The session locks the run directory, restores and saves all parts,
-counts, logs, evaluates, shows progress, and ends the loop at `total_env_steps` or on a signal.
+"""Training session: everything around the loop of a recipe, which collects and learns.
 
 Several processes may train together (`parallel`): they run the loop in lockstep, each with its own environments and
 replay; counters and statistics of episodes cover all processes, and only rank 0 logs and evaluates.
@@ -11,10 +8,11 @@ from __future__ import annotations
 
 import logging
 import shutil
-import signal
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, ExitStack, contextmanager
+from dataclasses import dataclass
 from pathlib import Path
+from signal import Signals
 from typing import Any, Protocol
 
 import torch
@@ -26,12 +24,12 @@ from torchrl.record.loggers import Logger
 from dreamer_racing import parallel
 from dreamer_racing.experience.rollouts import CollectorState, Rollouts, WorkerError
 from dreamer_racing.machine import KeptMemory
+from dreamer_racing.settings import COUNT, NOT_NEGATIVE, setting
 from dreamer_racing.training.checkpoint import BestCheckpoint, RunCheckpointError, RunCheckpoints
-from dreamer_racing.training.clock import Interval, Journal, Periods, RunClock
 from dreamer_racing.training.directory import RunDirectory, RunLock, latest_checkpoint
 from dreamer_racing.training.episodes import EpisodeTracker
-from dreamer_racing.training.metrics import MetricsLog, PendingMetrics
-from dreamer_racing.training.progress import Progress
+from dreamer_racing.training.metrics import Journal, MetricsLog
+from dreamer_racing.training.progress import Interval, Periods, Progress, RunClock
 from dreamer_racing.training.signals import GracefulExit
 
 logger = logging.getLogger(__name__)
@@ -40,9 +38,21 @@ OF_EACH_PROCESS = ("env", "tracker", "collector", "replay", "storage")
 """Parts that differ between processes; `storage` holds collected steps of the process's environments."""
 ENVIRONMENT_PARTS = ("env", "collector")
 """Parts that a run with workers does not have; if a checkpoint lacks them, the environments are reset on resume."""
-
 FIRST_CHECKPOINT = 1.5
 """Minutes until the first checkpoint of a run that saves during training: within two of its start [choice]."""
+
+
+@dataclass
+class EvaluationConfig:
+    """Evaluation during training."""
+
+    every: int = setting(25_000, NOT_NEGATIVE)  # env_steps between evaluations; 0 turns them off
+    first: int = setting(0, NOT_NEGATIVE)  # env_steps of an additional early evaluation; 0 for none
+    episodes: int = setting(8, COUNT)
+    stochastic: bool = False  # also evaluate the stochastic policy
+    # randomisation of starts, as a multiple of that in training; 0: all episodes begin at the start pose
+    start_noise: float = setting(0.0, NOT_NEGATIVE)
+    video_steps: int = setting(500, COUNT)  # control steps in the video
 
 
 class Evaluator(Protocol):
@@ -63,7 +73,7 @@ class Evaluator(Protocol):
 
 
 class Session:
-    """Training run without its algorithm.
+    """Training run without its algorithm: saves and restores, counts, logs, evaluates, and ends the loop.
 
     Args:
         config: Config of the recipe: any object with the fields `total_env_steps`, `seed`, `resume`, `logger` (`every`,
@@ -76,10 +86,9 @@ class Session:
 
     Attributes:
         counters: Numbers of `env_steps`, `updates` and `episodes` so far.
-        clock: Clock of the whole run.
+        timed: Function from the name of an activity to a context manager that adds up the time spent inside.
         began: Whether the loop has started; errors before that are mistakes of the user's configuration.
         parts: Parts that are saved, by name; see `track`.
-        evaluator: As given to `track`.
         metrics: Log of metrics, once `track` was called; None in ranks other than 0.
 
     Example:
@@ -95,14 +104,6 @@ class Session:
         >>> #     session.save_if_due()
     """
 
-    learner: Any
-    env: EnvBase
-    collected: Rollouts
-    evaluator: Evaluator | None
-    tracker: EpisodeTracker
-    checkpoints: RunCheckpoints
-    best: BestCheckpoint
-
     def __init__(
         self,
         config: Any,
@@ -113,7 +114,8 @@ class Session:
     ) -> None:
         self.config, self.directory = config, directory
         self.counters = {"env_steps": 0, "updates": 0, "episodes": 0}
-        self.clock = RunClock(self.counters, alone=parallel.num_processes() == 1)
+        self._clock = RunClock(self.counters, alone=parallel.num_processes() == 1)
+        self.timed = self._clock.timed
         self.began = False
         self.parts: dict[str, Any] = {}
         self.metrics: MetricsLog | None = None
@@ -127,6 +129,7 @@ class Session:
         self._stack = ExitStack()  # signals and progress
         self._stop = GracefulExit()
         self._progress = Progress(0, shown=False)
+        self._signal = 0  # number of the signal that some process has received
         self._due: dict[str, bool] = {}  # what is due after this rollout, once asked
         self._saves = False  # whether to save after this rollout
         self._another_follows = False  # whether another rollout is delivered before evaluating or saving
@@ -143,13 +146,9 @@ class Session:
 
     @property
     def stopping(self) -> bool:
-        """Whether a signal has come; all processes must read it equally often."""
-        return self._stop.requested
-
-    @property
-    def timed(self) -> Callable[[str], AbstractContextManager]:
-        """Function from the name of an activity to a context manager that adds up the time spent inside."""
-        return self.clock.timed
+        """Whether any process has received a signal; all processes must read it equally often."""
+        self._signal = self._signal or parallel.all_reduce_max(self._stop.number)
+        return self._signal != 0
 
     def track(
         self,
@@ -164,20 +163,19 @@ class Session:
     ) -> None:
         """Register the parts of the run, which checkpoints hold; restore them if the run is resumed.
 
-        If workers collect, the environment is closed with the session and not saved. Ranks other than 0 have no
-        evaluator. Besides the learner, the best checkpoint holds the parts that ``best`` names. Further ``parts`` are
-        those of `RunCheckpoints`.
+        Ranks other than 0 have no evaluator. Besides the learner, the best checkpoint holds the parts that ``best``
+        names. Further ``parts`` are those of `RunCheckpoints`.
         """
         self.learner, self.env, self.collected = learner, env, rollouts
         self.evaluator, self.tracker = evaluator, tracker
         worlds = {"env": env, "collector": CollectorState(rollouts.collector)} if rollouts.has_worlds else {}
-        journal = Journal(self._periods, PendingMetrics())
+        journal = Journal(self._periods.latest)
         self.parts = {"learner": learner, "counters": self.counters, **worlds, "tracker": tracker, **parts}
         self.parts["journal"] = journal
         path, resume = self.directory.path, self.config.resume
         self.checkpoints = RunCheckpoints(path, self.parts, self.config.checkpoint.keep, OF_EACH_PROCESS)
         if resume:
-            self.clock.total = self.checkpoints.load(resume, may_lack=ENVIRONMENT_PARTS)
+            self._clock.total = self.checkpoints.load(resume, may_lack=ENVIRONMENT_PARTS)
             updates = self.counters["updates"]
             logger.info("resumed %s at %s env_steps, %s updates", resume, f"{self.env_steps:,}", f"{updates:,}")
             rollouts.begin_at(self.env_steps)
@@ -187,8 +185,8 @@ class Session:
         if parallel.is_first():
             self.directory.set_aside_after(self.env_steps)
             self._note_start(self.env_steps)
-            resumed = journal.pending.written if resume else None
-            self.metrics = MetricsLog(path, self._make_loggers(resumed), resumed, journal.pending)
+            resumed = journal.written if resume else None
+            self.metrics = MetricsLog(path, self._make_loggers(resumed), resumed, journal)
         logger.info("run directory: %s", path)
 
     def rollouts(self) -> Iterator[TensorDictBase | None]:
@@ -210,7 +208,7 @@ class Session:
             yield None
         try:
             while not (self.at_end or self.stopping):
-                with self.clock.timed("collect"):
+                with self.timed("collect"):
                     rollout = next(self.collected, None)
                 if rollout is None:  # only on a stop, if the next rollout would take too long
                     break
@@ -286,7 +284,7 @@ class Session:
         assert self.metrics is not None, "track() makes them"
         self.learner.check_finite()
         devices = [self.learner.device] if self.learner.device.type == "cuda" else []
-        with self.clock.timed("evaluate"), torch.random.fork_rng(devices=devices):
+        with self.timed("evaluate"), torch.random.fork_rng(devices=devices):
             torch.manual_seed(self.config.seed)
             metrics = self.evaluator.make(self.env_steps, self.config.evaluation.stochastic)
             if self.config.logger.media:
@@ -306,8 +304,7 @@ class Session:
     def write_row(self, metrics: Mapping[str, Tensor | float] | None = None) -> None:
         """Write and show a row: the averages of the metrics logged since the latest row, and of these metrics."""
         assert self.metrics is not None, "only rank 0 writes rows"
-        self.log(self.clock.read())
-        self.log(metrics or {})
+        self.log(self._clock.read() | dict(metrics or {}))
         values = self.metrics.close_row(self.env_steps)
         with self.attempt("metrics"):
             self.metrics.flush()
@@ -321,10 +318,10 @@ class Session:
 
     def save(self) -> Path:
         """Save everything, unless an update was not finite or the networks differ between processes."""
-        with self.clock.timed("save"):
+        with self.timed("save"):
             self.learner.check_finite()  # first, because NaN weights never compare equal
             parallel.check_same(getattr(self.learner, "weights", []))
-            return self.checkpoints.save(self.env_steps, self.clock.total)
+            return self.checkpoints.save(self.env_steps, self._clock.total)
 
     @contextmanager
     def attempt(self, what: str) -> Iterator[None]:
@@ -369,14 +366,13 @@ class Session:
         self.began = True
         first = parallel.is_first()
         answer = "saving; a second signal discards all since the last checkpoint" if first else ""
-        agree = parallel.all_reduce_max if parallel.num_processes() > 1 else None
-        self._stop = self._stack.enter_context(GracefulExit(answer, agree))
+        self._stop = self._stack.enter_context(GracefulExit(answer))
         begun = self.env_steps, self.counters["updates"]
         self._progress = self._stack.enter_context(Progress(self.config.total_env_steps, *begun, shown=first))
         self._stop.write, self.write_line = self._progress.write_from_handler, self._progress.write_line
         if self.evaluator is not None:
             self.evaluator.on_episode, self.evaluator.attempt = self._progress.evaluating, self.attempt
-        self.collected.stopping = lambda: self._stop.signal_name is not None
+        self.collected.stopping = lambda: self._stop.requested
         if first and self.directory.finished_env_steps() > self.env_steps:
             self.directory.finished.unlink()  # the run resumes from before its end
 
@@ -384,12 +380,12 @@ class Session:
         """Save everything, and report how the run ended."""
         saved = self.save()
         if self.stopping:
-            at = f"at {self.env_steps:,} of {self.config.total_env_steps:,} env_steps"
-            self.write_line(f"{self._stop.signal_name} {at}: saved; continue with resume={self.directory.path}")
+            at = f"{Signals(self._signal).name} at {self.env_steps:,} of {self.config.total_env_steps:,} env_steps"
+            self.write_line(f"{at}: saved; continue with resume={self.directory.path}")
         elif self.metrics is not None:
             self.metrics.flush()
             self.directory.mark_finished(self.env_steps)
         self.write_line(f"checkpoint: {saved}")
         self._stack.close()
-        if self._stop.signal_name:
-            raise SystemExit(128 + signal.Signals[self._stop.signal_name])
+        if self.stopping:
+            raise SystemExit(128 + self._signal)

@@ -27,10 +27,9 @@ class GracefulExit:
 
     Args:
         answer: Text to print at the first signal, after its name; empty for none.
-        agree: If several processes train together, a reduction of their signal numbers (0: no signal) to a common one.
-            Then reading `requested` is a collective operation, so all processes must read it equally often.
 
     Attributes:
+        number: Number of the first signal; 0 before.
         write: Function that prints the answer from within the handler, which may have interrupted a write to a stream.
 
     Example:
@@ -39,20 +38,16 @@ class GracefulExit:
         ...         break
     """
 
-    def __init__(self, answer: str = "", agree: Callable[[int], int] | None = None) -> None:
+    def __init__(self, answer: str = "") -> None:
+        self.number = 0
         self.write: Callable[[str], None] = say_at_once
         self._answer = answer
-        self._agree = agree
-        self._arrived = 0  # number of the signal that this process received
-        self.signal_name: str | None = None
         self._previous: dict[signal.Signals, Any] = {}
 
     @property
     def requested(self) -> bool:
-        """Whether any process has received a signal."""
-        if self._agree and self.signal_name is None and (number := self._agree(self._arrived)):
-            self.signal_name = signal.Signals(number).name
-        return self.signal_name is not None
+        """Whether this process has received a signal."""
+        return self.number != 0
 
     def __enter__(self) -> GracefulExit:
         if threading.current_thread() is threading.main_thread():
@@ -67,18 +62,15 @@ class GracefulExit:
         self._previous.clear()
 
     def _handle(self, number: int, frame: FrameType | None) -> None:
-        name = signal.Signals(number).name
         if number == signal.SIGHUP:
             leave_terminal()
-        if self._arrived:
-            if signal.SIGHUP in (number, self._arrived):
+        if self.number:
+            if signal.SIGHUP in (number, self.number):
                 return
             raise KeyboardInterrupt(number)
-        self._arrived = number
-        if not self._agree:
-            self.signal_name = name
+        self.number = number
         if self._answer:
-            self.write(f"{name}: {self._answer}")
+            self.write(f"{signal.Signals(number).name}: {self._answer}")
 
 
 def run_passing_signals(command: list[str], log: Path) -> int:

@@ -23,7 +23,7 @@ from dreamer_racing.losses import DreamerV3Losses, LatentPPOLosses, LossConfig, 
 from dreamer_racing.modules import get_size
 from dreamer_racing.modules.autoencoder import smallest_map
 from dreamer_racing.settings import COUNT, NOT_NEGATIVE, POSITIVE, SEED, Range, check_settings, setting
-from dreamer_racing.training.clock import CheckpointConfig, EvaluationConfig
+from dreamer_racing.training.checkpoint import CheckpointConfig
 from dreamer_racing.training.directory import RunDirectory
 from dreamer_racing.training.schedule import (
     DreamerV3ScheduleConfig,
@@ -31,6 +31,7 @@ from dreamer_racing.training.schedule import (
     ReplayRatio,
     ScheduleConfig,
 )
+from dreamer_racing.training.session import EvaluationConfig
 
 
 @dataclass
@@ -82,11 +83,6 @@ class RunConfig:
     many_processes: ClassVar[bool] = False  # whether torchrun may start several that train together
 
     @property
-    def schedules_start_on_line(self) -> bool:
-        """Whether the share of episodes that begin on a line changes in the run."""
-        return False
-
-    @property
     def run_directory(self) -> RunDirectory:
         """The run's directory, once `resolve_common` has chosen it."""
         assert self.run_dir is not None, "resolve_common() sets it"
@@ -99,11 +95,7 @@ class RunConfig:
         return with_decoys(track, self.decoys)
 
     def check(self) -> None:
-        """Refuse settings with which a resolved run could not work.
-
-        Raises:
-            ValueError: the message names the setting as it is written, its value, and what would be right.
-        """
+        """Refuse settings with which a resolved run could not work, by their names and with what would be right."""
         check_settings(self)
         self.logger.check()
         if parallel.asked_for() > 1 and not self.many_processes:
@@ -111,10 +103,6 @@ class RunConfig:
                 f"WORLD_SIZE={parallel.asked_for()}: algorithm={self.algorithm} trains in one process; only "
                 "recipes/dreamer_v3.py and latent_ppo.py support torchrun. Start it without torchrun."
             )
-        self.check_worlds()
-
-    def check_worlds(self) -> None:
-        """Refuse an invalid environment, starts or start noise that the track forbids, and noise outside races."""
         env, noise = self.env, self.evaluation.start_noise
         env.check()
         if not is_race(self):
@@ -129,7 +117,8 @@ class RunConfig:
             StartSampler(track, start_noise=noise)
         except ValueError as error:
             raise ValueError(f"evaluation.{error}") from error
-        if not self.schedules_start_on_line:
+        schedule = getattr(self, "schedule", None)
+        if schedule is None or schedule.start_on_line.to is None:  # else the share changes in the run
             env.check_shares()
 
 
@@ -144,7 +133,7 @@ class ReplayRunConfig(RunConfig):
 
     def make_replay_ratio(self) -> ReplayRatio:
         """Make the replay ratio, which counts the updates that are due."""
-        raise NotImplementedError(f"{type(self).__name__} must implement make_replay_ratio().")
+        raise NotImplementedError
 
     def check(self) -> None:
         """Check as `RunConfig.check`, and refuse settings with which there would be no update."""
@@ -185,11 +174,6 @@ class WorldModelRunConfig(ReplayRunConfig):
     schedule: ScheduleConfig = field(default_factory=ScheduleConfig)
 
     many_processes: ClassVar[bool] = True
-
-    @property
-    def schedules_start_on_line(self) -> bool:
-        """Whether the schedule moves the share of episodes that begin on a line."""
-        return self.schedule.start_on_line.to is not None
 
     def make_replay_ratio(self) -> ReplayRatio:
         """Make the replay ratio, which counts the updates that are due."""

@@ -5,6 +5,7 @@ from __future__ import annotations
 import importlib.util
 import io
 import json
+from contextlib import closing
 from pathlib import Path
 
 import numpy as np
@@ -46,7 +47,7 @@ def test_tensorboard_shows_configuration_plots_and_films(run_dir, tmp_path):
     (sink,) = make_loggers(run_dir, LoggerConfig())
     sink.log_configuration(SETTINGS, "seed: 3\ntrack: circle\n")
     other = CSVLogger(exp_name="other", log_dir=str(tmp_path))  # which need not know of films
-    with MetricsLog(run_dir, [sink, other]) as log:
+    with closing(MetricsLog(run_dir, [sink, other])) as log:
         log.log_evaluation(2000)
         log.push({"evaluation/return_mean": 1.0})
         log.write(2000)
@@ -100,7 +101,7 @@ def test_wandb_offline_keeps_all_and_a_resumed_run_is_the_same_run(run_dir, monk
         (sink,) = make_loggers(run_dir, OFFLINE, resumed)
         assert sink.experiment.settings.mode in ("offline", "dryrun") and sink.experiment.offline
         sink.log_configuration(SETTINGS, "")
-        with MetricsLog(run_dir, [sink], resumed) as log:
+        with closing(MetricsLog(run_dir, [sink], resumed)) as log:
             log.push({"loss": 1.5})
             log.write((resumed or 0) + 1000)
             if resumed:

@@ -168,7 +168,7 @@ def test_commands_are_taken_while_it_flies(fresh: PlantVehicle, incoming: socket
     deadline = time.monotonic() + 10.0
     while (fresh.on_stand or receiver.received < 30) and time.monotonic() < deadline:
         time.sleep(0.02)
-    stop.signal_name = "SIGTERM"
+    stop.number = 15
     thread.join(5.0)
     link.close()
     assert not thread.is_alive() and not fresh.on_stand and fresh.armed

@@ -13,9 +13,9 @@ from unittest.mock import Mock
 import pytest
 
 from dreamer_racing.training import directory
-from dreamer_racing.training.clock import Interval, Journal, Periods
 from dreamer_racing.training.directory import RunDirectory, RunLock, complete_checkpoints, fresh_directory, replace_text
-from dreamer_racing.training.metrics import PendingMetrics
+from dreamer_racing.training.metrics import Journal
+from dreamer_racing.training.progress import Interval, Periods
 
 
 def test_the_best_of_a_run_knows_the_run_and_a_run_that_is_called_best_is_its_own(tmp_path: Path) -> None:
@@ -128,14 +128,8 @@ def test_a_killed_process_holds_nothing(tmp_path: Path) -> None:
     RunLock(tmp_path).release()
 
 
-def test_an_abandoned_folder_goes_if_it_was_made_for_the_lock(tmp_path: Path) -> None:
-    directory = RunDirectory(tmp_path / "run")
-    directory.claim().abandon()
-    assert not directory.path.exists()
-
-
-@pytest.mark.parametrize("written", ["before", "after"])
-def test_an_abandoned_folder_stays_if_it_was_there_or_was_written_to(written: str, tmp_path: Path) -> None:
+@pytest.mark.parametrize("written", ["never", "before", "after"])
+def test_an_abandoned_folder_goes_unless_it_was_there_or_was_written_to(written: str, tmp_path: Path) -> None:
     directory = RunDirectory(tmp_path / "run")
     if written == "before":
         directory.path.mkdir()
@@ -143,7 +137,7 @@ def test_an_abandoned_folder_stays_if_it_was_there_or_was_written_to(written: st
     if written == "after":
         directory.config.touch()
     lock.abandon()
-    assert directory.path.exists()
+    assert directory.path.exists() is (written != "never")
     directory.claim().release()  # the next one gets it
 
 
@@ -172,11 +166,10 @@ def test_at_the_end_what_has_been_since_the_latest_is_due() -> None:
 
 
 def test_what_was_due_when_a_run_was_saved_is_due_when_it_goes_on() -> None:
-    saved = Journal(Periods(log=100, save=100), PendingMetrics())
-    assert saved.periods.due("log", 130)
-    journal = Journal(Periods(log=100, save=100), PendingMetrics())
-    journal.load_state_dict(saved.state_dict())
-    assert not journal.periods.due("log", 130) and journal.periods.due("save", 130)
+    saved, resumed = (Periods(log=100, save=100) for _ in range(2))
+    assert saved.due("log", 130)
+    Journal(resumed.latest).load_state_dict(Journal(saved.latest).state_dict())
+    assert not resumed.due("log", 130) and resumed.due("save", 130)
 
 
 @pytest.mark.parametrize(
@@ -187,7 +180,7 @@ def test_the_first_time_of_an_interval_may_come_sooner(
     minutes: float, first: float, expected: list[int], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     now = [0.0]
-    monkeypatch.setattr("dreamer_racing.training.clock.time.monotonic", lambda: now[0])
+    monkeypatch.setattr("dreamer_racing.training.progress.time.monotonic", lambda: now[0])
     interval, due = Interval(minutes, first), []
     for minute in range(1, 25):
         now[0] = 60.0 * minute

@@ -15,8 +15,16 @@ from pathlib import Path
 import pytest
 
 from dreamer_racing.training import signals
-from dreamer_racing.training.clock import MEASURED, REMEMBERED, SETTLING, RunClock, TimeLeft
-from dreamer_racing.training.progress import COLUMNS, LiveTable, Progress
+from dreamer_racing.training.progress import (
+    COLUMNS,
+    MEASURED,
+    REMEMBERED,
+    SETTLING,
+    LiveTable,
+    Progress,
+    RunClock,
+    TimeLeft,
+)
 from dreamer_racing.training.signals import GracefulExit
 
 
@@ -65,14 +73,15 @@ def test_one_of_several_processes_knows_the_wall_clock_alone():
 # What a run says of itself in a log; what it shows in a terminal is below.
 
 
-METRICS = {"episode/return": 12.345, "episode/gates_passed": 3.0, "rate/updates": 5.5, "loss": 1.25}
+TRAINING = {"episode/return": 12.345, "episode/gates_passed": 3.0, "rate/updates": 5.5, "loss": 1.25}
+EVALUATION = {"evaluation/success_rate": 0.5, "evaluation/return_mean": 30.25, "evaluation/lap_time_mean": 4.5}
 
 
 def test_a_log_gets_whole_lines_now_and_then(capsys: pytest.CaptureFixture[str]) -> None:
     with Progress(total=1_000_000, env_steps=500_000, seconds=0.0) as progress:
         progress.show({"evaluation/success_rate": 0.5, "evaluation/lap_time_mean": 4.5})
         progress.advance(512_000, updates=0)
-        progress.show(METRICS)
+        progress.show(TRAINING)
         progress.write_line("evaluation at 512,000 env_steps")
     said = capsys.readouterr()
     assert "\r" not in said.err + said.out
@@ -99,7 +108,7 @@ def test_a_log_shows_what_a_terminal_does(capsys: pytest.CaptureFixture[str]) ->
 
 
 def test_what_is_not_saved_is_said(capsys: pytest.CaptureFixture[str]) -> None:
-    Progress(total=10, seconds=0.0).show(METRICS, unsaved={"checkpoint": 5, "metrics": 1000})
+    Progress(total=10, seconds=0.0).show(TRAINING, unsaved={"checkpoint": 5, "metrics": 1000})
     assert "NOT SAVED checkpoint since 5; metrics since 1,000" in capsys.readouterr().err
 
 
@@ -114,13 +123,13 @@ def test_a_log_that_takes_no_more_ends_nothing(monkeypatch: pytest.MonkeyPatch) 
 
 def test_what_a_log_is_spared(capsys: pytest.CaptureFixture[str]) -> None:
     with Progress(total=10, seconds=0.0, shown=False) as progress:  # of several processes one alone speaks
-        progress.show(METRICS)
+        progress.show(TRAINING)
         progress.evaluating(12, 60)
         progress.write_line("evaluation")
     with Progress(total=10, seconds=3600.0) as progress:  # lines keep their distance, and evaluations have none
         for step in range(10):
             progress.advance(step, updates=0)
-            progress.show(METRICS)
+            progress.show(TRAINING)
             progress.evaluating(12, 60)
     assert capsys.readouterr() == ("", "")
 
@@ -208,10 +217,6 @@ def test_a_run_that_went_past_its_end_has_nothing_left() -> None:
 def test_a_run_that_does_not_advance_has_no_answer() -> None:
     run = Run()
     assert run.go(100, speed=0) == [MEASURING]
-
-
-TRAINING = {"episode/return": 12.345, "episode/gates_passed": 3.0, "rate/updates": 5.5, "loss": 1.25}
-EVALUATION = {"evaluation/success_rate": 0.5, "evaluation/return_mean": 30.25, "evaluation/lap_time_mean": 4.5}
 
 
 class Terminal(io.StringIO):

@@ -160,20 +160,20 @@ def of(error: float) -> dict[str, torch.Tensor]:
     return {"reward_error": torch.tensor(error)}
 
 
-def measure(lag: ModelLag, ratio: float) -> float | torch.Tensor:
-    for _ in range(3):
-        lag.add_training_error(of(0.5))
-    return lag.add_fresh_error(of(0.5 * ratio))["lag/ratio"]
+def measure(lag: ModelLag, *ratios: float) -> float | torch.Tensor:
+    for ratio in ratios:
+        for _ in range(3):
+            lag.add_training_error(of(0.5))
+        found = lag.add_fresh_error(of(0.5 * ratio))["lag/ratio"]
+    return found
 
 
 def test_it_waits_above_the_limit_and_goes_on_below():
     lag = ModelLag(limit=1.25)
     assert measure(lag, 1.2) == pytest.approx(1.2) and not lag.waits
-    for _ in range(MEDIAN_WINDOW):
-        measure(lag, 1.5)
+    measure(lag, *[1.5] * MEDIAN_WINDOW)
     assert lag.waits
-    for _ in range(MEDIAN_WINDOW):
-        measure(lag, 1.0)
+    measure(lag, *[1.0] * MEDIAN_WINDOW)
     assert not lag.waits
 
 
@@ -181,19 +181,14 @@ def test_one_odd_flight_is_no_lag_and_one_good_one_not_its_end():
     lag = ModelLag(limit=2.0)
     for ratio in (1.0, 1.0, 1.0, 30.0, 1.0, 1.0):
         assert measure(lag, ratio) == pytest.approx(1.0) and not lag.waits
-    for _ in range(MEDIAN_WINDOW):
-        measure(lag, 3.0)
-    assert measure(lag, 1.0) == pytest.approx(3.0) and lag.waits
+    assert measure(lag, *[3.0] * MEDIAN_WINDOW, 1.0) == pytest.approx(3.0) and lag.waits
 
 
 def test_it_does_not_wait_for_ever_and_again_only_after_the_model_has_caught_up():
     lag = ModelLag(limit=2.0)
     waited = [measure(lag, 3.0) and lag.waits for _ in range(2 * PATIENCE)]
     assert waited == [True] * PATIENCE + [False] * PATIENCE
-    for _ in range(MEDIAN_WINDOW):
-        measure(lag, 1.0)
-    for _ in range(MEDIAN_WINDOW):
-        measure(lag, 3.0)
+    measure(lag, *[1.0] * MEDIAN_WINDOW, *[3.0] * MEDIAN_WINDOW)
     assert lag.waits
 
 
@@ -236,8 +231,7 @@ def test_it_is_measured_once_a_period_and_tells_when_the_actor_waits(caplog: pyt
     lag = ModelLag(limit=2.0, every=100)
     assert [steps for steps in range(0, 450, 30) if lag.due(steps)] == [120, 210, 300, 420]
     with caplog.at_level("INFO", "dreamer_racing"):
-        for ratio in (1.0, *(3.0,) * MEDIAN_WINDOW, *(1.0,) * MEDIAN_WINDOW):
-            measure(lag, ratio)
+        measure(lag, 1.0, *[3.0] * MEDIAN_WINDOW, *[1.0] * MEDIAN_WINDOW)
     assert len(caplog.messages) == 2
     assert caplog.messages[0].startswith("the actor waits: ") and caplog.messages[0].endswith("(wait_for_model=2)")
     assert caplog.messages[1].startswith("the actor continues: ")

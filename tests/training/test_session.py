@@ -172,7 +172,7 @@ def test_a_run_that_saves_on_the_way_does_so_within_two_minutes(
     every: int, saved: list[int], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     now = [0.0]
-    monkeypatch.setattr("dreamer_racing.training.clock.time.monotonic", lambda: now[0])
+    monkeypatch.setattr("dreamer_racing.training.progress.time.monotonic", lambda: now[0])
     run = Run(tmp_path, total=200, rollout=4, save_every=every)
 
     def pass_time(updates: int) -> None:
@@ -205,7 +205,7 @@ def test_the_first_is_a_request_which_the_handler_answers_and_the_second_an_inte
         assert not stop.requested
         os.kill(os.getpid(), number)
         assert os.read(reader, 100) == f"\n{number.name}: saving\n".encode(), "before the loop asks"
-        assert stop.requested and stop.signal_name == number.name
+        assert stop.requested and stop.number == number
         if number != signal.SIGHUP:
             with pytest.raises(KeyboardInterrupt):  # noqa: PT012 - the signal may arrive a little later
                 os.kill(os.getpid(), signal.SIGINT)
@@ -239,7 +239,7 @@ def test_a_terminal_that_goes_is_no_second_signal(numbers: tuple[signal.Signals,
     with GracefulExit() as stop:
         for number in numbers:
             os.kill(os.getpid(), number)  # a KeyboardInterrupt would abandon the run
-        assert stop.signal_name == numbers[0].name
+        assert stop.number == numbers[0]
 
 
 PROGRAM = """
