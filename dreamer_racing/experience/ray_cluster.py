@@ -1,7 +1,4 @@
-"""Ray cluster for collection: connecting to it, checking its resources and versions, and starting workers.
-
-All mistakes that a user can fix are reported here, before the first rollout.
-"""
+"""Ray cluster for collection: connecting to it, checking its resources and versions, and starting workers."""
 
 from __future__ import annotations
 
@@ -51,14 +48,7 @@ class WorkersConfig:
         return "cuda" if self.gpus else "cpu"
 
     def check(self, frames: int) -> None:
-        """Check that ``gpus`` is at most 1 or a whole number, and that weights may be two rounds old.
-
-        Args:
-            frames: env_steps of a round of all workers.
-
-        Raises:
-            ValueError: It is not so; the message gives an allowed number.
-        """
+        """Raise ``ValueError`` unless weights may be two rounds of ``frames`` old, and GPUs are whole or a fraction."""
         if self.gpus > 1 and self.gpus % 1:
             raise ValueError(
                 f"workers.gpus={self.gpus:g}: a worker can have a fraction of one GPU or a whole number of GPUs, e.g. "
@@ -75,9 +65,7 @@ class WorkersConfig:
 def join(address: str) -> bool:
     """Connect to a Ray cluster, unless this process is connected already; return whether it was connected now.
 
-    Args:
-        address: ``local`` starts a cluster on this machine with all its CPUs and GPUs; ``auto`` is one that already
-            runs here; otherwise the address of its head, ``host:port``.
+    The address is that of `WorkersConfig`; a local cluster has all CPUs and GPUs of this machine.
 
     Raises:
         ValueError: Ray is not installed, or there is no such cluster, or it has other versions; the message says which.
@@ -121,11 +109,7 @@ def resources() -> tuple[list[dict[str, float]], dict[str, float]]:
 def check_resources(
     workers: int, share: WorkersConfig, nodes: Sequence[Mapping[str, float]], free: Mapping[str, float]
 ) -> None:
-    """Check that a cluster of these nodes has the resources for all workers, a ``share`` each.
-
-    Raises:
-        ValueError: It does not; the message gives the needed and the available resources.
-    """
+    """Raise ``ValueError`` unless a cluster of these nodes has the resources for all workers, a ``share`` each."""
     for name, option, each in (("CPU", "workers.cpus", share.cpus), ("GPU", "workers.gpus", share.gpus)):
         there, needed = free.get(name, 0.0), workers * each
         if needed > there:
@@ -211,13 +195,7 @@ def start_workers(
 
 
 def check_nodes(share: WorkersConfig, make_env: Callable[[], EnvBase], policy: DreamerPolicy) -> None:
-    """Check that every node can run a worker; otherwise Ray would silently restart one there again and again.
-
-    Every node must be able to unpickle and run ``make_env``, and to unpickle the policy.
-
-    Raises:
-        ValueError: A node cannot; the message names the node, and what is wrong there.
-    """
+    """Raise ``ValueError`` unless every node can run a worker; otherwise Ray would restart it again and again."""
     import ray
     from ray.util.scheduling_strategies import NodeAffinitySchedulingStrategy
 
@@ -245,11 +223,7 @@ def check_nodes(share: WorkersConfig, make_env: Callable[[], EnvBase], policy: D
 
 
 def check_versions(node: str, found: Mapping[str, str | None], here: Mapping[str, str | None]) -> None:
-    """Check that a node has the versions of this process.
-
-    Raises:
-        ValueError: They differ; the message names the node, and both versions.
-    """
+    """Raise ``ValueError`` unless a node has the versions of this process; the message gives both."""
     if others := [f"{name} {found.get(name)} (here {own})" for name, own in here.items() if found.get(name) != own]:
         raise ValueError(
             f"collector=ray: node {node} has {', '.join(others)}. Install the same versions there, or choose another "
@@ -268,12 +242,11 @@ def _await_resources(workers: int, share: WorkersConfig) -> None:
     for left in reversed(range(10)):
         try:
             check_resources(workers, share, *resources())
+            break
         except ValueError:
             if not left:
                 raise
             time.sleep(0.5)
-        else:
-            return
 
 
 def in_a_line(error: Exception, last: bool = False) -> str:

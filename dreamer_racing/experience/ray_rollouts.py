@@ -1,17 +1,10 @@
 """Collection by workers on a Ray cluster: scheduling of rounds, transfer of weights, and recovery of lost workers.
 
-TorchRL's `RayCollector` starts and ends the workers; each is a TorchRL `Collector` (`RayWorker`). Rollouts and weights
-go through Ray's object store. This module decides when.
-
 A *round* is one rollout of every worker, concatenated to one rollout ``[N, T]`` of all environments: worker w has
-environments ``w·N/W`` to ``(w + 1)·N/W − 1``. So consumers of rollouts (replay streams, episode statistics, on-policy
-actors) need not know of workers. While the learner uses one round, exactly one more is collected; faster workers wait,
-so rounds never queue up.
+environments ``w·N/W`` to ``(w + 1)·N/W − 1``. While the learner uses one round, exactly one more is collected.
 
-If a worker's process dies, Ray restarts it wherever there are resources, and repeats the request. The lost part of its
-rollout was never delivered; the other workers' rollouts are kept, and the round is delivered once it is complete. So
-every frame counts once, and delivered frames are never lost. The restarted worker's environments are reset; records,
-episodes and returns recognise that by ``is_init``.
+If a worker's process dies, Ray restarts it with newly reset environments, which records, episodes and returns recognise
+by ``is_init``, and repeats the request. The round is delivered once it is complete, so every frame counts once.
 
 TorchRL's own loop over Ray workers and its weight synchronisation are not used, because neither survives the loss of a
 worker: the loop ends with the error and drops the rollouts in progress of other workers; `RayWeightSyncScheme` is a
@@ -145,10 +138,7 @@ class RayRollouts(Rollouts):
         self._flown_with = self._taken_at
 
     def _receive(self) -> TensorDictBase | None:
-        """Wait for the round in progress; return None if there is none, or if it is abandoned because the run stops.
-
-        The frames of an abandoned round are lost, so no round can follow it.
-        """
+        """Wait for the round in progress; None if there is none, or if it is lost because the run stops: the last."""
         asked, self._asked = self._asked, []
         self._is_over = self._is_over or bool(asked)
         if not asked or not self._wait(asked):
@@ -157,14 +147,8 @@ class RayRollouts(Rollouts):
         for worker, result in enumerate(results):
             if result.is_first and self._all_flew:
                 self.lost += 1
-                host, process = result.process
-                logger.warning(
-                    "worker %d was lost in round %d: process %d on %s replaces it, with newly reset environments",
-                    worker,
-                    self.rounds,
-                    process,
-                    host,
-                )
+                words = "worker %d was lost in round %d: process %d on %s replaces it, with newly reset environments"
+                logger.warning(words, worker, self.rounds, *reversed(result.process))
         self._all_flew, self._is_over = True, False
         self.processes = [result.process for result in results]
         self.seconds = max(result.seconds for result in results)
@@ -172,11 +156,7 @@ class RayRollouts(Rollouts):
         return unpack_rollout(*(result.rollout for result in results))
 
     def _wait(self, asked: list[Any]) -> bool:
-        """Wait until every worker has answered; return False if the run stops and they take too long.
-
-        Raises:
-            WorkerError: A worker has not answered for ``patience`` seconds.
-        """
+        """Wait until every worker has answered; return False if the run stops and they take too long."""
         import ray
 
         begun, reminded, pending = time.monotonic(), 0.0, asked
@@ -201,11 +181,7 @@ class RayRollouts(Rollouts):
 
 
 def _fetch(worker: int, asked: Any) -> WorkerResult:
-    """Fetch the answer of a worker.
-
-    Raises:
-        WorkerError: The worker failed, or is lost and cannot be restarted.
-    """
+    """Fetch the answer of a worker; raise ``WorkerError`` if it failed, or is lost and cannot be restarted."""
     import ray
 
     try:

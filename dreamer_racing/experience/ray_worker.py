@@ -28,23 +28,14 @@ from dreamer_racing.machine import PACKAGES, git_commit
 
 
 class Arrays(NamedTuple):
-    """Entries of a TensorDict as arrays; names of its dimensions are lost.
-
-    Attributes:
-        batch_size: Batch size of the TensorDict.
-        entries: Arrays by key; keys of nested TensorDicts are tuples.
-    """
+    """Entries of a TensorDict as arrays by key; names of its dimensions are lost."""
 
     batch_size: tuple[int, ...]
     entries: dict[NestedKey, np.ndarray]
 
 
 def as_arrays(data: TensorDictBase) -> Arrays:
-    """Convert the tensors of a TensorDict to arrays, which share the memory of contiguous CPU tensors.
-
-    Raises:
-        TypeError: A tensor has a type that NumPy does not have, such as bfloat16.
-    """
+    """Convert the tensors of a TensorDict to arrays, which share the memory of contiguous CPU tensors."""
     tensors = data.data.to("cpu").items(include_nested=True, leaves_only=True)
     return Arrays(tuple(data.batch_size), {key: value.contiguous().numpy() for key, value in tensors})
 
@@ -115,13 +106,9 @@ class Request(NamedTuple):
 
 
 class WorkerResult(NamedTuple):
-    """Answer of a worker.
+    """Answer of a worker: packed rollout ``[N/W, T]``, whether it is its first, host and process ID, and time it took.
 
-    Attributes:
-        rollout: Packed rollout ``[N/W, T]``.
-        is_first: Whether it is the worker's first one, with freshly reset environments.
-        process: Host and process ID.
-        seconds: Time that the worker took for it.
+    At its first rollout a worker resets all environments.
     """
 
     rollout: Arrays
@@ -153,7 +140,10 @@ class RayWorker(Collector):
             setattr(attrgetter(".".join(path))(self.env.base_env) if path else self.env.base_env, attribute, value)
         is_first = self._taken_at is None
         if is_first:
-            self._begin((self._seed + request.round) % 2**32)
+            seed = (self._seed + request.round) % 2**32
+            torch.manual_seed(seed)  # the global generator is this worker's alone, like its process
+            self.set_seed(seed)
+            self.reset()
         if request.taken_at != self._taken_at:
             import ray
 
@@ -163,12 +153,6 @@ class RayWorker(Collector):
         result = WorkerResult(pack_rollout(rollout), is_first, process, time.perf_counter() - start)
         self._flown = request.round, result
         return result
-
-    def _begin(self, seed: int) -> None:
-        """Seed and reset all environments; the global generator is this worker's alone, like its process."""
-        torch.manual_seed(seed)
-        self.set_seed(seed)
-        self.reset()
 
     def __bool__(self) -> bool:
         """Return True, because Ray evaluates it before it reports an error, when TorchRL's ``__len__`` would fail.

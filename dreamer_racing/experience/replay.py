@@ -12,7 +12,6 @@ import json
 import math
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import ExitStack
 from dataclasses import dataclass
 from enum import Enum
 from pathlib import Path
@@ -137,9 +136,7 @@ class StreamReplay(TensorDictReplayBuffer):
         Return None if no streams are held out, or if they are still too short.
         """
         slots = self._sampler.held_out(num_windows, length, recent)
-        if slots is None:
-            return None
-        return self._transformed(self._storage.get(slots))
+        return None if slots is None else self._transformed(self._storage.get(slots))
 
     def newest(self, length: int) -> TensorDictBase | None:
         """Return the newest records of every stream, ``[N, length]``, transformed like samples.
@@ -165,10 +162,13 @@ class StreamReplay(TensorDictReplayBuffer):
         path = Path(path)
         path.mkdir(parents=True, exist_ok=True)
         fields = []
+        starts = range(0, self._storage.max_size, self._writer.stream_length)
+        pairs = zip(starts, self._writer.filled.tolist(), strict=True)
+        filled = [slice(start, start + count) for start, count in pairs if count]  # not full: never wrapped around
         with ThreadPoolExecutor(torch.get_num_threads()) as threads:  # compression releases the GIL
             for number, (key, stored) in enumerate(self._storage.fields() if len(self) else ()):
                 with (path / _FIELD.format(number)).open("wb") as file:
-                    frames = threads.map(_compressed, (stored[part] for part in self._filled()))
+                    frames = threads.map(_compressed, (stored[part] for part in filled))
                     sizes = [file.write(frame) for frame in frames]
                 layout = {"shape": list(stored.shape[1:]), "dtype": str(stored.dtype)}
                 fields.append({"key": key, **layout, "frames": sizes})
@@ -179,112 +179,82 @@ class StreamReplay(TensorDictReplayBuffer):
         """Restore what `dumps` saved.
 
         Raises:
-            ValueError: If the saved streams or records do not have this replay's shape, or are uncompressed, as in
-                older versions.
+            ValueError: If the saved streams or records do not have this replay's shape.
         """
         path = Path(path)
         state = self._read_state(path)
         self._writer.load_state_dict(state["streams"])
-        self._read_streams(path, state, range(self._writer.num_streams), first=0)
+        for stream in range(self.num_streams):
+            self._read_stream(path, state, stream, stream)
         self._rng.set_state(torch.tensor(state["generator"], dtype=torch.uint8))
 
     def load_shards(self, paths: Sequence[str | Path], skip: int) -> None:
         """Load this replay's number of streams from several saved replays, which are concatenated in their order.
 
-        So streams can be redistributed to another number of replays. The random generator stays as it is.
-
-        Args:
-            paths: Folders of the saved replays.
-            skip: Number of streams at the beginning that other replays load.
+        The random generator stays as it is. Other replays load the first ``skip`` streams.
 
         Raises:
             ValueError: As in ``loads``; also if there are too few streams.
         """
-        here, wanted, before = self._writer, range(skip, skip + self._writer.num_streams), 0
-        streams = {"num_streams": here.num_streams, "stream_length": here.stream_length, "write_count": 0}
-        assigned: list[tuple[Path, dict[str, Any], range, int]] = []  # folder, its state, chosen streams, first target
-        cursor, filled = list[int](), list[int]()
+        here = self._writer
+        streams: list[tuple[Path, dict[str, Any], int]] = []  # all that are saved: folder, its state, number in it
         for path in map(Path, paths):
             state = self._read_state(path)
-            saved = state["streams"]
-            StreamWriter(saved["num_streams"], here.stream_length).check(saved)
-            begin, end = (min(max(stream - before, 0), saved["num_streams"]) for stream in (skip, wanted.stop))
-            chosen = range(begin, end)
-            assigned.append((path, state, chosen, len(filled)))
-            cursor += [saved["cursor"][stream] for stream in chosen]
-            filled += [saved["filled"][stream] for stream in chosen]
-            before += saved["num_streams"]
-        if len(filled) != here.num_streams:
+            saved = state["streams"]["num_streams"]
+            StreamWriter(saved, here.stream_length).check(state["streams"])
+            streams += [(path, state, stream) for stream in range(saved)]
+        chosen = streams[skip : skip + here.num_streams]
+        if len(chosen) != here.num_streams:
             raise ValueError(
-                f"The saved replays have {before} streams, but streams {skip} to {wanted.stop} are needed: resume with "
-                "the same number of environments."
+                f"The saved replays have {len(streams)} streams, but streams {skip} to {skip + here.num_streams} are "
+                "needed: resume with the same number of environments."
             )
-        here.load_state_dict({**streams, "cursor": cursor, "filled": filled, "write_count": sum(filled)})
-        for path, state, chosen, first in assigned:
-            self._read_streams(path, state, chosen, first)
+        cursor, filled = (
+            [state["streams"][name][number] for _, state, number in chosen] for name in ("cursor", "filled")
+        )
+        state = {**here.state_dict(), "cursor": cursor, "filled": filled, "write_count": sum(filled)}
+        here.load_state_dict(state)
+        for target, (path, state, stream) in enumerate(chosen):
+            self._read_stream(path, state, stream, target)
 
     def _read_state(self, path: Path) -> dict[str, Any]:
         """Read the state of a folder, and check that it fits this replay, before anything is restored."""
         state = json.loads((path / "replay.json").read_text(encoding="utf-8"))
-        for field in state["fields"]:
+        fields = state["fields"]
+        for field in fields:
             field["key"] = field["key"] if isinstance(field["key"], str) else tuple(field["key"])
-        self._check_fields([field["key"] for field in state["fields"]], state["fields"])
-        has, wants = (any(field["key"][0] == CONTEXT for field in state["fields"]), self.latents is not None)
-        if state["fields"] and has is not wants:
-            raise ValueError(
-                f"The saved replay was recorded {'with' if has else 'without'} latents, and this one is "
-                f"{'with' if wants else 'without'} latents: resume with replay.context={str(has).lower()}."
-            )
-        self._check_frames(path, state)
-        return state
-
-    def _read_streams(self, path: Path, state: dict[str, Any], chosen: range, first: int) -> None:
-        """Read the chosen streams of a folder into this replay's streams from ``first`` on."""
-        filled, length = state["streams"]["filled"], self._writer.stream_length
-        with ExitStack() as stack:
-            files = [
-                stack.enter_context((path / _FIELD.format(number)).open("rb")) for number in range(len(state["fields"]))
-            ]
-            frame = sum(count > 0 for count in filled[: chosen.start])  # an empty stream has no frame
-            for field, file in zip(state["fields"], files, strict=True):
-                file.seek(sum(field["frames"][:frame]))
-            for stream in chosen:
-                if not filled[stream]:
-                    continue
-                records = TensorDict({}, batch_size=[filled[stream]])
-                for field, file in zip(state["fields"], files, strict=True):
-                    shape = (*records.batch_size, *field["shape"])
-                    records.set(field["key"], _expanded(file.read(field["frames"][frame]), shape, _dtype(field)))
-                start = (first + stream - chosen.start) * length
-                self._storage.set(slice(start, start + filled[stream]), records, set_cursor=False)
-                frame += 1
-
-    def _filled(self) -> list[slice]:
-        """Return the filled slots of each stream; a ring that is not full has never wrapped around."""
-        starts = range(0, self._storage.max_size, self._writer.stream_length)
-        pairs = zip(starts, self._writer.filled.tolist(), strict=True)
-        return [slice(start, start + count) for start, count in pairs if count]
-
-    def _check_fields(self, keys: list[NestedKey], fields: list[dict[str, Any]]) -> None:
-        """Check that saved fields have the layout of the stored ones."""
-        if any("frames" not in field for field in fields):
-            raise ValueError("The saved replay has the uncompressed format of an older version: it cannot be read.")
-        layouts = {
-            key: torch.empty(0, *field["shape"], dtype=_dtype(field)) for key, field in zip(keys, fields, strict=True)
-        }
+        layouts = {field["key"]: torch.empty(0, *field["shape"], dtype=_dtype(field)) for field in fields}
         for key, stored in self._storage.fields() if fields else ():
             if key not in layouts:
                 raise ValueError(f"The replay stores {key!r}, which the saved one does not have.")
             check_layout(key, layouts[key], stored)
-
-    @staticmethod
-    def _check_frames(path: Path, state: dict[str, Any]) -> None:
-        """Check that every file has the size of a frame for each stream, before anything is restored."""
+        has, wants = (any(field["key"][0] == CONTEXT for field in fields), self.latents is not None)
+        if fields and has is not wants:
+            raise ValueError(
+                f"The saved replay was recorded {'with' if has else 'without'} latents, and this one is "
+                f"{'with' if wants else 'without'} latents: resume with replay.context={str(has).lower()}."
+            )
         streams = sum(filled > 0 for filled in state["streams"]["filled"])
-        for number, field in enumerate(state["fields"]):
+        for number, field in enumerate(fields):
             file = path / _FIELD.format(number)
             if len(field["frames"]) != streams or file.stat().st_size != sum(field["frames"]):
                 raise ValueError(f"{file} does not hold a frame for each of {streams} streams.")
+        return state
+
+    def _read_stream(self, path: Path, state: dict[str, Any], stream: int, target: int) -> None:
+        """Read a stream of a folder into one of this replay's streams."""
+        filled = state["streams"]["filled"]
+        if not filled[stream]:
+            return
+        frame = sum(count > 0 for count in filled[:stream])  # an empty stream has no frame
+        records = TensorDict({}, batch_size=[filled[stream]])
+        for number, field in enumerate(state["fields"]):
+            with (path / _FIELD.format(number)).open("rb") as file:
+                file.seek(sum(field["frames"][:frame]))
+                content = file.read(field["frames"][frame])
+            records.set(field["key"], _expanded(content, (filled[stream], *field["shape"]), _dtype(field)))
+        start = target * self._writer.stream_length
+        self._storage.set(slice(start, start + filled[stream]), records, set_cursor=False)
 
 
 def _dtype(field: dict[str, Any]) -> torch.dtype:
@@ -356,7 +326,12 @@ def make_replay(
         >>> replay.batch_size, len(replay)
         (16, 0)
     """
-    stream_length = _stream_length(capacity, num_envs, batch_length)
+    stream_length = capacity // num_envs
+    if stream_length < batch_length:
+        raise ValueError(
+            f"capacity={capacity} gives each of num_envs={num_envs} streams {stream_length} records, less than one "
+            f"window of batch_length={batch_length}: the capacity must be at least {num_envs * batch_length}."
+        )
     if not 0.0 <= recent_share <= 1.0:
         raise ValueError(f"recent_share={recent_share}: must be between 0 and 1.")
     if not 0 <= held_out < num_envs:
@@ -383,17 +358,6 @@ def make_replay(
     if records.device != torch.empty((), device=device).device:
         replay.append_transform(_delivery(records.device, torch.device(device)))
     return replay
-
-
-def _stream_length(capacity: int, num_envs: int, batch_length: int) -> int:
-    """Return the number of records per stream; raise ``ValueError`` if a stream cannot hold one window."""
-    stream_length = capacity // num_envs
-    if stream_length < batch_length:
-        raise ValueError(
-            f"capacity={capacity} gives each of num_envs={num_envs} streams {stream_length} records, less than one "
-            f"window of batch_length={batch_length}: the capacity must be at least {num_envs * batch_length}."
-        )
-    return stream_length
 
 
 def _delivery(kept_on: torch.device, device: torch.device) -> Callable[[TensorDictBase], TensorDictBase]:

@@ -16,11 +16,9 @@ from dreamer_racing.modules.rssm import LatentFormat
 
 
 class ReplayPlace(NamedTuple):
-    """Where one process stores its replay.
+    """Where one process stores a replay of ``capacity`` records, of ``size`` bytes when full.
 
     Attributes:
-        capacity: Number of records.
-        size: Bytes when full.
         device: Device that stores the records.
         files: Folder of memory-mapped files; None for memory.
     """
@@ -35,11 +33,7 @@ class ReplayPlace(NamedTuple):
         return f"replay: {self.capacity:,} records, {self.size / 1e9:.1f} GB when full, in {where}"
 
     def prepare(self) -> None:
-        """Make the folder of files, if there is one, without what a killed run left in it.
-
-        Raises:
-            ValueError: The replays of all processes do not fit.
-        """
+        """Check that the replays of all processes fit, and make the folder of files without a killed run's."""
         asked = f"replay.capacity={self.capacity * parallel.num_processes():,}"
         if self.files is None:
             sharing = parallel.num_local_processes() if self.device == "cpu" else 1
@@ -71,12 +65,7 @@ def replay_bytes(
 ) -> int:
     """Return the size in bytes of a replay of ``capacity`` records (12.3 KB each at 64×64).
 
-    Args:
-        capacity: Number of records.
-        image_shape: Shape of ``pixels``.
-        action_size: A.
-        numbers: Number of float32 values observed besides the image: ``vector`` and the privileged one.
-        latents: Format of stored latents, if any.
+    ``numbers`` are the float32 values observed besides the image: ``vector`` and the privileged one.
     """
     flags, context = 1 + len(END_KEYS), latents.bytes if latents else 0
     floats = action_size + len(RACE_REWARD_KEYS) + numbers

@@ -55,10 +55,7 @@ class Rollouts(Iterator[TensorDictBase]):
         """Continue a run that was resumed at ``env_steps``."""
 
     def drain(self) -> TensorDictBase | None:
-        """Return the rollout in progress, if any, and start no other before the next ``next()``.
-
-        A checkpoint's states of replay, environment and collector are then consistent.
-        """
+        """Return the rollout in progress, if any, so that the parts' states are consistent; start no other."""
         return None
 
     def close(self) -> None:
@@ -66,11 +63,7 @@ class Rollouts(Iterator[TensorDictBase]):
 
 
 class CollectorState:
-    """State that a TorchRL collector carries between rollouts: observations and the policy's recurrent state.
-
-    Args:
-        collector: A ``Collector``, whose environment is saved separately.
-    """
+    """State that a TorchRL collector carries between rollouts: observations and the policy's recurrent state."""
 
     def __init__(self, collector: Any) -> None:
         self._collector = collector
@@ -81,11 +74,7 @@ class CollectorState:
         return self._collector._carrier.exclude("collector").clone().to_dict()
 
     def load_state_dict(self, state_dict: Mapping[str, Any]) -> None:
-        """Restore what ``state_dict`` returned.
-
-        Raises:
-            ValueError: If it has another number of environments.
-        """
+        """Restore what ``state_dict`` returned; raise ``ValueError`` for another number of environments."""
         saved, present = len(state_dict["is_init"]), self._collector._carrier.batch_size[0]
         if saved != present:
             raise ValueError(
@@ -132,12 +121,9 @@ class RolloutStorage:
 
     @torch.no_grad()
     def extend(self, rollout: TensorDictBase) -> None:
-        """Store a rollout ``[N, T]``.
+        """Store a rollout ``[N, T]``, or raise ``KeyError`` if it lacks one of ``keys``.
 
         If an environment was reset within an episode, as of a lost worker, its last stored step is marked as done.
-
-        Raises:
-            KeyError: If the rollout lacks one of ``keys``.
         """
         if missing := [key for key in self.keys if rollout.get(key, None) is None]:
             raise KeyError(f"The rollout lacks {missing}, which on-policy learning needs from policy and environment.")

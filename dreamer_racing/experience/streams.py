@@ -45,9 +45,8 @@ def records_from_rollout(
     the first observation of its episode. An episode of K steps therefore has K + 1 records.
 
     Args:
-        rollout: Batch ``[N, T]`` (further leading dimensions, as of a multi-process collector, are flattened into N)
-            with root keys ``action``, ``is_init`` and the observations, and ``("next", ...)`` keys of the
-            observations, the rewards, ``terminated``, ``truncated``.
+        rollout: Batch ``[N, T]`` with root keys ``action``, ``is_init`` and the observations, and ``("next", ...)``
+            keys of the observations, the rewards, ``terminated``, ``truncated``.
         observation_keys: Keys of an observation that are stored.
         reward_keys: Keys of rewards that are stored.
         latents: Format in which the policy's latents before a record's observation are stored as its ``context``; None
@@ -114,11 +113,7 @@ def _rows(tensor: Tensor) -> Tensor:
 
 
 def check_layout(key: NestedKey, new: Tensor, stored: Tensor) -> None:
-    """Check that new values ``(M, ...)`` have the type and shape of the stored ones ``(N·L, ...)``.
-
-    Raises:
-        ValueError: They do not; the message gives both layouts.
-    """
+    """Raise ``ValueError`` unless new values ``(M, ...)`` have the type and shape of the stored ones ``(N·L, ...)``."""
     layout, expected = ((value.dtype, list(value.shape[1:])) for value in (new, stored))
     if layout != expected:
         raise ValueError(f"The replay stores {key!r} as {expected}, got {layout}.")
@@ -210,8 +205,6 @@ class StreamWriter(Writer):
         filled: int64 ``(N,)``, records each stream holds.
     """
 
-    cursor: Tensor
-    filled: Tensor
     _storage: RecordStorage
     _write_count: int
 
@@ -226,13 +219,9 @@ class StreamWriter(Writer):
         raise NotImplementedError("Only whole rollouts can be added: use extend().")
 
     def extend(self, data: TensorDictBase) -> Tensor:
-        """Write records with one indexed copy per key.
+        """Write records ``[M]`` of `records_from_rollout`; return their slots, int64 ``(M,)``, on the CPU.
 
-        Args:
-            data: Records ``[M]`` of `records_from_rollout`. If a stream receives more than L, the newest L are kept.
-
-        Returns:
-            Slots, int64 ``(M,)``, on the CPU.
+        If a stream receives more than L, the newest L are kept.
 
         Raises:
             ValueError: If the rollout has another number of environments.
@@ -243,11 +232,10 @@ class StreamWriter(Writer):
         count = torch.bincount(stream, minlength=self.num_streams)  # (N,)
         slots = stream * self.stream_length + (self.cursor[stream] + order) % self.stream_length
         kept = order >= (count - self.stream_length)[stream]
-        records = data.exclude("stream", "order")
-        if kept.all():
-            self._storage.set(slots, records, set_cursor=False)
-        else:
-            self._storage.set(slots[kept], records[kept.to(data["stream"].device)], set_cursor=False)
+        records, written = data.exclude("stream", "order"), slots
+        if not kept.all():
+            records, written = records[kept.to(data["stream"].device)], slots[kept]
+        self._storage.set(written, records, set_cursor=False)
         self.cursor = (self.cursor + count) % self.stream_length
         self.filled = (self.filled + count).clamp(max=self.stream_length)
         self._write_count += len(stream)
@@ -267,20 +255,12 @@ class StreamWriter(Writer):
 
     def state_dict(self) -> dict[str, Any]:
         """Return everything that a checkpoint needs."""
-        return {
-            "num_streams": self.num_streams,
-            "stream_length": self.stream_length,
-            "cursor": self.cursor.tolist(),
-            "filled": self.filled.tolist(),
-            "write_count": self._write_count,
-        }
+        streams = {"num_streams": self.num_streams, "stream_length": self.stream_length}
+        positions = {"cursor": self.cursor.tolist(), "filled": self.filled.tolist()}
+        return {**streams, **positions, "write_count": self._write_count}
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
-        """Restore the cursors.
-
-        Raises:
-            ValueError: If the state has another number or length of streams.
-        """
+        """Restore the cursors; see `check`."""
         self.check(state_dict)
         self.cursor = torch.tensor(state_dict["cursor"], dtype=torch.int64)
         self.filled = torch.tensor(state_dict["filled"], dtype=torch.int64)
@@ -288,11 +268,7 @@ class StreamWriter(Writer):
         self._storage.set_length(int(self.filled.sum()))
 
     def check(self, state_dict: dict[str, Any]) -> None:
-        """Check that a saved state has the same number and length of streams.
-
-        Raises:
-            ValueError: It does not; the message gives both.
-        """
+        """Raise ``ValueError`` unless a saved state has the same number and length of streams."""
         saved = (state_dict["num_streams"], state_dict["stream_length"])
         if saved != (self.num_streams, self.stream_length):
             raise ValueError(
@@ -315,8 +291,7 @@ class StreamSampler(RandomSampler):
     Args:
         writer: Writer of the sampled streams.
         batch_length: T.
-        recent_share: Share of a batch's windows that are drawn from the newest records of the streams.
-        recent_length: Number of these newest records per stream, at least T.
+        recent_share: Share of windows that are drawn from the newest ``recent_length`` records per stream, at least T.
         held_out: Number of last streams that are never sampled.
     """
 
@@ -357,10 +332,7 @@ class StreamSampler(RandomSampler):
         return torch.cat(slots), {"recent": is_recent.unsqueeze(-1).expand(-1, self.batch_length)}
 
     def held_out(self, num_windows: int, length: int, recent: int | None = None) -> Tensor | None:
-        """Return the slots of windows in the held-out streams, or None; see `StreamReplay.held_out`.
-
-        The seed is the number of records written, so the number of earlier calls does not matter.
-        """
+        """Return the slots of windows in the held-out streams, or None; see `StreamReplay.held_out`."""
         reach = self.writer.filled.masked_fill(~self._held_out, 0)  # (N,)
         reach = reach if recent is None else reach.clamp(max=recent)
         if int(reach.max()) < length:
