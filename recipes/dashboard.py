@@ -62,8 +62,7 @@ class Source(NamedTuple):
 
     flight: ShownFlight
     track: Track
-    folder: Path
-    """Folder of the run, or else that of the stored flight."""
+    folder: Path  # of the run, or else of the stored flight
 
 
 @recipe("dashboard", DashboardConfig)
@@ -87,12 +86,7 @@ def main(config: DashboardConfig) -> None:
 
 
 def find(config: DashboardConfig) -> list[Source]:
-    """Find or fly the requested flight, and the one to compare it with.
-
-    Raises:
-        ValueError: a file cannot be read, or the two flights are of different tracks.
-        OSError: there is no such flight.
-    """
+    """Find or fly the requested flight, and the one to compare it with, on the same track."""
     places = [locate("run", config.run) if config.run is not None else str(config.agent)]
     places += [] if config.against is None else [locate("against", config.against)]
     sources = [read(place) if isinstance(place, Path) else fly(place, config) for place in places]
@@ -108,11 +102,7 @@ def find(config: DashboardConfig) -> list[Source]:
 
 
 def locate(setting_name: str, place: str) -> Path | str:
-    """Return what `run=` or `against=` names: the file of a stored flight, or the name of an agent to fly.
-
-    Raises:
-        FileNotFoundError: there is nothing of that name, or no flight in it; the message says what would be right.
-    """
+    """Return what `run=` or `against=` names: the file of a stored flight, or the name of an agent to fly."""
     path = existing_agent_path(setting_name, place)
     if path.is_file():
         return path

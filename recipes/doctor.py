@@ -13,7 +13,7 @@ from pathlib import Path
 
 from composing.entry import recipe
 
-from dreamer_racing.doctor import Diagnosis, Verdict, examine
+from dreamer_racing.doctor import Verdict, examine
 from dreamer_racing.settings import COUNT, setting
 
 
@@ -48,17 +48,12 @@ def main(config: DoctorConfig) -> None:
     for finding in examine(config.replay.capacity, config.checkpoint.keep, Path(config.run_dir)):
         findings.append(finding)
         if not config.json:
-            print(line(finding), flush=True)
+            remedy = f"\n{'':25}→ {finding.remedy}" if finding.remedy else ""
+            print(f"{finding.what:<14} {finding.state.value:<9} {finding.found}{remedy}", flush=True)
     if config.json:
         print(json.dumps([{**finding._asdict(), "state": finding.state.value} for finding in findings], indent=1))
     if any(finding.state is Verdict.wrong for finding in findings):
         raise SystemExit(1)
-
-
-def line(finding: Diagnosis) -> str:
-    """Return a finding as a line, and its remedy as another."""
-    remedy = f"\n{'':25}→ {finding.remedy}" if finding.remedy else ""
-    return f"{finding.what:<14} {finding.state.value:<9} {finding.found}{remedy}"
 
 
 if __name__ == "__main__":

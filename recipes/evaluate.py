@@ -19,7 +19,6 @@ from composing.entry import plain_disk_errors, plain_errors, recipe
 from composing.restoring import FlightConfig, Restored, restore
 
 from dreamer_racing.envs.race.starts import StartSampler
-from dreamer_racing.envs.tracks import Track
 from dreamer_racing.evaluation.protocol import CONDITIONS, EPISODES, MODES, Result, check_conditions, run_protocol
 from dreamer_racing.figures.protocol import write_markdown
 from dreamer_racing.figures.report import EvaluationReport, report_condition
@@ -55,7 +54,11 @@ def main(config: EvaluateConfig) -> None:
     """Restore the policy, fly it, report."""
     with plain_errors():
         restored = restore(config)
-        refuse_races(config, restored.trained.saved_track())
+        track = restored.trained.saved_track()
+        if config.protocol == "full":
+            check_conditions(CONDITIONS, track, config.seed)
+        else:
+            StartSampler(track, start_noise=config.start_noise)  # refuses noise that the track leaves no room for
         directory = fresh_directory(config.run_dir or RunDirectory(restored.run_dir).evaluation, EVALUATION)
         print(f"race: {restored.trained.track}, {restored.trained.env.preset}, {config.episodes} episodes")
         report = None
@@ -76,14 +79,6 @@ def main(config: EvaluateConfig) -> None:
             write_markdown(directory, results, written["provenance"])
         replace_text(directory / EVALUATION, json.dumps(written, indent=2, allow_nan=False) + "\n")
     say(f"\nwritten to {directory}")
-
-
-def refuse_races(config: EvaluateConfig, track: Track) -> None:
-    """Refuse conditions or start noise that the track leaves no room for."""
-    if config.protocol == "full":
-        check_conditions(CONDITIONS, track, config.seed)
-    else:
-        StartSampler(track, start_noise=config.start_noise)
 
 
 def evaluate_nominal(report: EvaluationReport) -> dict[str, Any]:

@@ -85,12 +85,7 @@ def directory_of(config: ExperimentConfig) -> Path:
 
 
 def complete_run(config: ExperimentConfig, run_dir: Path, given: list[str]) -> None:
-    """Start, resume or skip a run, and print which.
-
-    Raises:
-        ValueError: the run is refused.
-        RuntimeError: its recipe failed.
-    """
+    """Start, resume or skip a run, and print which; raise ``RuntimeError`` if its recipe failed."""
     command = next_command(config, given)
     if command is None:
         print(f"{run_dir}: finished, skipped", flush=True)
@@ -109,9 +104,6 @@ def next_command(config: ExperimentConfig, given: list[str]) -> list[str] | None
     """Return the command that completes a run; None if it is complete.
 
     Of the given overrides of the experiment, all but its own settings go to the recipe.
-
-    Raises:
-        ValueError: the algorithm or the variant is unknown, or the directory holds a run with other settings.
     """
     check(config)
     run_dir = directory_of(config)
@@ -149,11 +141,7 @@ def refuse_other_settings(run_dir: Path, saved: dict[str, Any], wanted: dict[str
 
 
 def settings_of(overrides: Iterable[str]) -> dict[str, Any]:
-    """Return the values of overrides by name, parsed as YAML, without those that may differ when a run is resumed.
-
-    Raises:
-        ValueError: a value is not valid YAML.
-    """
+    """Return the values of overrides by name, parsed as YAML, without those that may differ when a run is resumed."""
     values = {}
     for override in map(str, overrides):
         if (name := override_key(override)) in ("run_dir", "total_env_steps"):

@@ -115,7 +115,10 @@ def fly(config: FlyConfig) -> None:
     """Fly one episode of all laps, and write its numbers, plot and films."""
     with folder_to_fill(Path(config.run_dir)) as directory:
         flight = make_flight(config)
-        outside = open_view(flight.env) if config.view == "chase" else None
+        outside = None
+        if config.view == "chase":
+            with plain_errors():  # without OpenGL
+                outside = ChaseView(flight.env.track, flight.env.worlds.parameters, size=GIF_SIZE)
         result = flight.fly()
         flight.env.close()
         laps = ", ".join(f"{duration:.2f} s" for duration in result.lap_times)
@@ -208,12 +211,6 @@ def agents_flight(config: FlyConfig) -> PlannedFlight:
     print(f"{config.agent} on {track.name}, {track.laps} laps, physics: {restored.trained.env.preset}")
     course = Course(restored.flyer.evaluation_policy(), worlds, episodes=1)
     return PlannedFlight(course.base, partial(course.evaluate, value_function=restored.flyer.value_function()))
-
-
-def open_view(env: DroneRacingEnv) -> ChaseView:
-    """Make the chase view, so that missing OpenGL fails before the flight."""
-    with plain_errors():
-        return ChaseView(env.track, env.worlds.parameters, size=GIF_SIZE)
 
 
 if __name__ == "__main__":

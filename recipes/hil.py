@@ -116,11 +116,7 @@ class Prepared(NamedTuple):
 
 
 def prepare(config: HilConfig, opened: ExitStack) -> Prepared:
-    """Make and open all that a flight needs; ``opened`` closes it.
-
-    Raises:
-        ValueError, OSError, ImportError: Something does not fit, cannot be used, or is not installed.
-    """
+    """Make and open all that a flight needs; ``opened`` closes it."""
     config.stamping = stamping_of(config)
     flyer, contract = make_flyer(config)
     track = load_track(config.track) if config.track else trained_track(contract)

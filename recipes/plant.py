@@ -53,15 +53,13 @@ def main(config: PlantConfig) -> None:
         sockets = open_sockets(config)
         firmware = None
         if config.firmware is not None:
-            firmware = start_firmware(config.firmware, config, sockets, settings_for(config.actor))
+            if config.actor == PILOT:
+                contract = pilot_contract(HilConfig(actor=PILOT))
+            else:
+                contract = read_contract(existing_agent_path("actor", config.actor))
+            lines = print_settings(contract, "betaflight_sitl")  # that set it up for the actor
+            firmware = start_firmware(config.firmware, config, sockets, lines)
     run(vehicle, config, config, sockets, firmware)
-
-
-def settings_for(actor: str) -> list[str]:
-    """Return CLI lines that set up a firmware for an actor."""
-    if actor == PILOT:
-        return print_settings(pilot_contract(HilConfig(actor=PILOT)), "betaflight_sitl")
-    return print_settings(read_contract(existing_agent_path("actor", actor)), "betaflight_sitl")
 
 
 if __name__ == "__main__":

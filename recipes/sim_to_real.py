@@ -60,7 +60,7 @@ def main(config: SimToRealConfig) -> None:
         studies = [(config.actor, make_flyer)]
         others = []
         if config.beside == PILOT:
-            studies.append((PILOT, pilot_on(track, config)))
+            studies.append((PILOT, partial(PilotFlyer, track, config.preset, config.rate)))
         elif config.beside:
             others.append(json.loads(Path(config.beside).read_text(encoding="utf-8")))
     results = [fly(actor, make, track, config) for actor, make in studies]
@@ -84,12 +84,7 @@ def fly(actor: str, make_flyer: Callable[[], Flyer], track: Track, config: SimTo
 
 
 def check(config: SimToRealConfig) -> tuple[Track, Callable[[], Flyer]]:
-    """Check the settings; return the track and the factory of the flyer.
-
-    Raises:
-        ValueError: the message names the field and what is allowed.
-        OSError: there is no such actor.
-    """
+    """Check the settings; return the track and the factory of the flyer."""
     load_preset(config.preset)
     for name in config.sweeps or ():
         check_choice("sweeps", name, SWEEPS)
@@ -99,18 +94,13 @@ def check(config: SimToRealConfig) -> tuple[Track, Callable[[], Flyer]]:
         if config.beside == PILOT:
             raise ValueError("beside=pilot and actor=pilot: it would fly the same twice; leave one out.")
         track = load_track(config.track)
-        return track, pilot_on(track, config)
+        return track, partial(PilotFlyer, track, config.preset, config.rate)
     path = existing_agent_path("actor", config.actor)
     contract = read_contract(path)
     track = load_track(config.track) if config.track else trained_track(contract)
     if note := check_contract(contract, track):
         print(f"note: {note}")
     return track, partial(ActorFlyer, path)
-
-
-def pilot_on(track: Track, config: SimToRealConfig) -> Callable[[], Flyer]:
-    """Return the factory of the pilot."""
-    return partial(PilotFlyer, track, config.preset, config.rate)
 
 
 if __name__ == "__main__":

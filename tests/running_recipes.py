@@ -18,7 +18,7 @@ import hydra
 from omegaconf import DictConfig, OmegaConf
 
 from dreamer_racing.training.session import Session
-from tests.forked import recipe, started  # noqa: F401 - for tests, beside the rest
+from tests.forked import recipe, started  # noqa: F401 - the latter for tests, beside the rest
 
 ROOT = Path(__file__).parents[1]
 CONFIG = ROOT / "recipes" / "config"
@@ -87,6 +87,13 @@ def prepared(*overrides: str, name: str = "dreamer_v3") -> Session:
         raise
     del session.rollouts
     return session
+
+
+def completed(name: str, *overrides: str, **given: Any) -> subprocess.CompletedProcess[str]:
+    """Run a recipe as `recipe` does, to its end without an error."""
+    done = recipe(name, *overrides, **given)
+    assert done.returncode == 0, done.stderr
+    return done
 
 
 def build(*overrides: str, name: str = "dreamer_v3") -> None:

@@ -52,7 +52,6 @@ from dreamer_racing.training.session import Evaluator
 if TYPE_CHECKING:
     from dreamer_racing.envs.control_suite import ControlSuiteEnv
 
-
 Environment: TypeAlias = "DroneRacingEnv | ControlSuiteEnv"
 
 
@@ -75,10 +74,7 @@ def shared_env_arguments(config: RunConfig) -> dict[str, Any]:
 
 
 def make_env(config: RunConfig, num_envs: int | None = None, num_threads: int | None = None) -> Environment:
-    """Make the training environment, of `env.num_envs` worlds by default.
-
-    A race's worlds are stepped and drawn by `num_threads`; None: one per CPU, at most `OMP_NUM_THREADS`.
-    """
+    """Make the training environment, of `env.num_envs` worlds by default, and as many threads as `DroneRacingEnv`."""
     num_envs = num_envs or config.env.num_envs
     readers = privileged_losses(config) if isinstance(config, WorldModelRunConfig) else []
     if is_race(config):
@@ -111,15 +107,8 @@ def make_suite(config: RunConfig, num_envs: int, seed: int, episode_steps: int |
     """Make a Control Suite environment; for training, `episode_steps` sets the control steps of an episode."""
     from dreamer_racing.envs.control_suite import ControlSuiteEnv  # importing it opens a display
 
-    env = config.env
-    return ControlSuiteEnv(
-        config.task,
-        num_envs,
-        from_pixels=env.from_pixels,
-        image_size=env.image_size,
-        seed=seed,
-        episode_steps=episode_steps,
-    )
+    sees: dict[str, Any] = {"from_pixels": config.env.from_pixels, "image_size": config.env.image_size}
+    return ControlSuiteEnv(config.task, num_envs, seed=seed, episode_steps=episode_steps, **sees)
 
 
 def make_evaluator(config: RunConfig, directory: Path, learner: Learner) -> Evaluator | None:
@@ -147,13 +136,7 @@ def make_agent(config: WorldModelRunConfig, interface: Interface) -> Agent:
 
 
 def load_initial_weights(learner: WorldModelLearner, config: WorldModelRunConfig, env: Environment) -> str:
-    """Load the weights that ``init_from`` names into a new learner; return a log line that describes them.
-
-    Raises:
-        FileNotFoundError: there is no such run, checkpoint or agent.
-        ValueError: it has another model size, or was trained with another camera, control rate or loss; or its
-            configuration is damaged.
-    """
+    """Load the weights that ``init_from`` names into a new learner, if they fit; return a log line on them."""
     source = str(config.init_from)
     folder = existing_agent_path("init_from", source)
     if not is_agent(folder):
@@ -232,14 +215,9 @@ def make_run_replay(
     batch: tuple[int, int],
     latents: LatentFormat | None = None,
 ) -> StreamReplay:
-    """Make the replay buffer, on the learner's device if it fits there; print its place and size.
+    """Make the replay of an environment's records, on the learner's device if it fits; print its place and size.
 
-    Args:
-        config: resolved.
-        env: environment whose records it stores.
-        curriculum: recomputes old rewards, if `curriculum.relabel` is set.
-        batch: windows per batch, and records per window.
-        latents: as in `make_replay`.
+    A batch has so many windows of so many records. The curriculum recomputes old rewards, if `curriculum.relabel`.
     """
     settings, interface, shown = config.replay, Interface.of(env), env.observation_spec.keys()
     numbers = interface.vector_dim + interface.privileged_dim

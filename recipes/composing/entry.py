@@ -28,12 +28,9 @@ from dreamer_racing.terminal import start_logging
 
 @contextmanager
 def plain_errors(applies: Callable[[], bool] = lambda: True, also: tuple[type[Exception], ...] = ()) -> Iterator[None]:
-    """Turn errors that the user can fix into one paragraph on stderr and exit status 2.
+    """Turn errors that the user can fix, `also` of further types, into one paragraph on stderr and exit status 2.
 
-    Args:
-        applies: asked at an error whether to do so; true during set-up only, since the same types of errors inside
-            training are defects, and keep their tracebacks.
-        also: further types of errors that the user can fix here.
+    It `applies` during set-up only: the same types of errors inside training are defects, and keep their tracebacks.
     """
     errors: tuple[type[Exception], ...] = (MissingMandatoryValue, ValueError, OSError, RendererUnavailableError, *also)
     try:
@@ -116,21 +113,18 @@ def recipe(
 ) -> Callable[[Callable[[Any], None]], Callable[[], None]]:
     """Return a decorator that turns a function of a configuration into the entry point of a recipe.
 
-    An override that hydra refuses is explained in one paragraph on stderr, with exit status 2. Ctrl-C, unless the
-    recipe handles it, ends the process with the shell's status of that signal.
-
-    Args:
-        name: of the recipe. Hydra composes the configuration from the file of this name in `config`; without
-            such a file it is the schema alone, and hydra writes no files.
-        schema: dataclass of the configuration.
-        composed: whether the function takes hydra's `DictConfig`, in which settings may be missing, instead of an
-            object of the dataclass that has passed the checks of ranges and of its method `check`, if it has one.
-        logs: whether to print the package's log messages on stdout; False where programs read stdout.
+    Hydra composes the configuration from the file of the recipe's name in `config`; without such a file it is the
+    schema alone, and hydra writes no files. The function takes an object of the schema that has passed all checks, or
+    if it is `composed`, hydra's `DictConfig`, in which settings may be missing. If it `logs`, the package's log
+    messages are printed on stdout.
     """
     SCHEMAS[name] = schema
     ConfigStore.instance().store(name=f"{name}_schema", node=schema)
     if not (CONFIG_DIR / f"{name}.yaml").is_file():
-        ConfigStore.instance().store(name=name, node=schema_alone(name))
+        silent = [{f"override hydra/{kind}_logging": "none"} for kind in ("job", "hydra")]
+        hydras = {"output_subdir": None, "run": {"dir": "."}}
+        node = {"defaults": [f"{name}_schema", "_self_", *silent], "hydra": hydras}
+        ConfigStore.instance().store(name=name, node=node)
 
     def decorate(function: Callable[[Any], None]) -> Callable[[], None]:
         @functools.wraps(function)
@@ -170,12 +164,6 @@ def to_checked_object(config: DictConfig) -> Any:
         if hasattr(settings, "check"):
             settings.check()
     return settings
-
-
-def schema_alone(name: str) -> dict[str, Any]:
-    """Return the primary configuration of a recipe without a YAML file: its schema, and no groups."""
-    silent = [{f"override hydra/{kind}_logging": "none"} for kind in ("job", "hydra")]
-    return {"defaults": [f"{name}_schema", "_self_", *silent], "hydra": {"output_subdir": None, "run": {"dir": "."}}}
 
 
 def normalise_argument(argument: str) -> str:

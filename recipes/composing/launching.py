@@ -6,6 +6,7 @@ import sys
 import threading
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
+from functools import partial
 from pathlib import Path
 from typing import Any, cast
 
@@ -51,13 +52,9 @@ def launch(
     train: Callable[[Any, Session], None],
     remedy: str,
 ) -> None:
-    """Compose the configuration of a recipe, and train in a session.
+    """Compose the configuration of a recipe, resolve the settings that it leaves open, and train in a session.
 
-    Args:
-        config: as hydra composed it.
-        resolve: fills in the settings that the configuration leaves open.
-        train: the recipe's loop, given configuration and session.
-        remedy: what to lower once a loss is not finite, e.g. "ppo.learning_rate".
+    The remedy is what to lower once a loss is not finite, e.g. "ppo.learning_rate".
     """
     start_logging()
     threading.excepthook = print_thread_error
@@ -114,11 +111,9 @@ def check_overrides(config: DictConfig, overrides: Sequence[str]) -> None:
 
 
 def check_read(config: DictConfig, overrides: Sequence[str]) -> None:
-    """Refuse settings that the chosen losses and replay do not read; losses of the user's own may read all.
+    """Refuse overrides, as the user wrote them, that the chosen losses and replay do not read.
 
-    Args:
-        config: composed.
-        overrides: as the user wrote them; settings from the file of a group are not refused.
+    Losses of the user's own may read all; settings from the file of a group are not refused.
     """
     targets = find_targets(config.loss.world_model)
 
@@ -179,11 +174,7 @@ def training_session(config: RunConfig, overrides: list[str], remedy: str) -> It
 
 
 def open_session(config: RunConfig, overrides: Sequence[str]) -> Session:
-    """Check the configuration, lock the run directory, and open a session in it.
-
-    Raises:
-        ValueError: a setting is invalid; or the directory holds another run, or a live run uses it.
-    """
+    """Check the configuration, lock the run directory, and open a session in it, unless it holds another run."""
     config.check()
     directory = config.run_directory
     lock = directory.claim() if parallel.is_first() else None
@@ -195,13 +186,8 @@ def open_session(config: RunConfig, overrides: Sequence[str]) -> Session:
                 f"run_dir={config.run_dir} holds a run already, with {newest.name}: continue it with "
                 f"resume={config.run_dir}, or choose another run_dir."
             )
-    return Session(
-        config,
-        directory,
-        lock,
-        lambda env_steps: write_configuration(directory, config, overrides, env_steps),
-        lambda resumed: make_run_loggers(config, directory, resumed),
-    )
+    note_start = partial(write_configuration, directory, config, overrides)
+    return Session(config, directory, lock, note_start, partial(make_run_loggers, config, directory))
 
 
 def write_configuration(directory: RunDirectory, config: RunConfig, overrides: Sequence[str], env_steps: int) -> None:
@@ -231,11 +217,7 @@ def print_thread_error(failure: threading.ExceptHookArgs) -> None:
 
 
 def resumed_config(algorithm: str, resume: str, overrides: list[str]) -> tuple[DictConfig, list[str]]:
-    """Return the saved configuration of the run to resume with the new overrides applied, and all its overrides.
-
-    Raises:
-        ValueError: the run is incomplete or of another algorithm, or an override would make it a different run.
-    """
+    """Return the saved configuration of the run to resume with the new overrides applied, and all its overrides."""
     if is_agent(resume) or (not Path(resume).exists() and is_agent(agent_path(resume))):
         raise ValueError(f"resume={resume} is an agent, not a run to resume: start one with init_from={resume}.")
     directory = RunDirectory.of(latest_checkpoint(resume))
@@ -270,10 +252,7 @@ def resumed_config(algorithm: str, resume: str, overrides: list[str]) -> tuple[D
 
 
 def is_finished(config: DictConfig) -> bool:
-    """Return whether the resumed run is already complete, and print so.
-
-    If its newest checkpoint is damaged, the run resumes from the one before.
-    """
+    """Return whether the resumed run is already complete, and print so; else it resumes from a sound checkpoint."""
     directory = RunDirectory(Path(config.run_dir))
     if directory.finished_env_steps() < config.total_env_steps:
         return False

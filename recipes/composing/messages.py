@@ -24,21 +24,16 @@ def is_follower_rank() -> bool:
 
 
 def say_error(error: object) -> None:
-    """Print on stderr why nothing was started.
-
-    Of several processes that `torchrun` started, the first prints at once. Its end makes torchrun end the others, which
-    wait before they print, so an error that all of them have is printed once.
-    """
+    """Print on stderr why nothing was started; other processes than the first wait, until its end ends them too."""
     if is_follower_rank():
         time.sleep(HEAD_START)
     print(f"error: {error}", file=sys.stderr, flush=True)
 
 
 def end_quietly(kind: type[BaseException], error: BaseException, trace: TracebackType | None) -> None:
-    """Print one word instead of a traceback for Ctrl-C during imports; to be installed as `sys.excepthook`.
+    """Print one word instead of a traceback for Ctrl-C during imports, and end by that signal; a `sys.excepthook`.
 
-    The process then ends by that signal, as shells expect. Left to the interpreter, the exit status would be 1 if an
-    exit handler of a package calls `exec`, as the creation of a dataclass does.
+    Left to the interpreter, the exit status would be 1 if an exit handler calls `exec`, as dataclasses do.
     """
     if issubclass(kind, KeyboardInterrupt):
         print(INTERRUPTED, file=sys.stderr, flush=True)
@@ -50,22 +45,14 @@ def end_quietly(kind: type[BaseException], error: BaseException, trace: Tracebac
 
 
 def refuse_without_packages() -> None:
-    """End with status 1 if this Python does not have the project's packages, and say how to run the recipe.
-
-    Raises:
-        SystemExit: one is missing.
-    """
+    """End with status 1 if this Python does not have the project's packages, and say how to run the recipe."""
     needed = FOR_HELP if {"--help", "-h"} & set(sys.argv[1:]) else NEEDED
     missing = [name for name in needed if importlib.util.find_spec(name) is None]
+    how = "Install it in this Python: pip install dreamer_racing."
+    if (ROOT / "dev").is_file():
+        how = (
+            f"Run {ROOT / 'dev'} python {Path(sys.argv[0]).absolute()}: it uses the project's environment, which the "
+            f"first start creates. Or install the project in your own: pip install -e {ROOT} (docs/installation.md)."
+        )
     if missing:
-        raise SystemExit(f"error: {sys.executable} has no {', '.join(missing)}. {how_to_run(sys.argv[0])}")
-
-
-def how_to_run(script: str) -> str:
-    """Return a sentence on how to run a script of this clone with all its packages."""
-    if not (ROOT / "dev").is_file():
-        return "Install it in this Python: pip install dreamer_racing."
-    return (
-        f"Run {ROOT / 'dev'} python {Path(script).absolute()}: it uses the project's environment, which the first "
-        f"start creates. Or install the project in your own: pip install -e {ROOT} (docs/installation.md)."
-    )
+        raise SystemExit(f"error: {sys.executable} has no {', '.join(missing)}. {how}")

@@ -38,6 +38,10 @@ TRAINING = ("dreamer_v3", "latent_ppo", "ppo", "sac")
 """The training recipes."""
 
 
+WIDTH, COLUMN = 118, 42
+"""Characters of a line of help, and those before its second column."""
+
+
 class Option(NamedTuple):
     """One option, or the fields of one schedule."""
 
@@ -81,18 +85,8 @@ def names(recipe: str) -> list[str]:
     return list(found)
 
 
-RENAMED = {
-    "loss.ppo.flown": "it is called loss.ppo.steps now",
-    "loss.ppo.updates": "was removed, because PPO no longer learns from imagined steps",
-    "loss.kl_mode": "was removed: free nats apply to the sum over latents, as in the reference",
-}
-"""Explanations for settings that were renamed or removed."""
-
-
 def no_such_setting(name: str, recipe: str) -> str:
     """Return a message that a recipe has no setting of this name, with the one that may be meant."""
-    if name in RENAMED:
-        return f"{name}: {RENAMED[name]}. docs/options.md has all settings."
     known = names(recipe)
     if name in known:  # a group that is not among the defaults
         return f"{name}: must be added with a plus: +{name}=..."
@@ -129,9 +123,6 @@ def check_arguments(recipe: str, arguments: Sequence[str]) -> None:
             raise ValueError(f"{name}={quoted}: must be the name of one of the group's configurations.")
         if name in found and re.fullmatch(r"\w+", value) and value not in (*found[name], "null"):
             raise ValueError(settings.wrong_choice(name, value, found[name]))
-
-
-WIDTH, COLUMN = 118, 42
 
 
 def handle_help_and_typos() -> None:

@@ -77,11 +77,16 @@ def resolve_baseline(config: DictConfig, num_envs: Mapping[str, int]) -> DictCon
         sees = "images" if config.env.from_pixels else "numbers"
         config.network.size = "paper" if config.env.from_pixels and config.budget != "smoke" else "small"
         print(f"network: {config.network.size} (network=auto, seeing {sees}, budget={config.budget})")
-    numbers = cast(DictConfig, OmegaConf.load(CONFIG_DIR / "network" / f"{config.network.size}.yaml"))
-    for name in ("layers", "units"):
-        if OmegaConf.is_missing(config.network, name):
-            config.network[name] = numbers[name]
+    fill_in(config.network, "network")
     return config
+
+
+def fill_in(group: DictConfig, folder: str) -> None:
+    """Fill in the settings that a group lacks from the file of its size."""
+    numbers = OmegaConf.load(CONFIG_DIR / folder / f"{group.size}.yaml")
+    for name in group:
+        if OmegaConf.is_missing(group, name):
+            group[name] = numbers[name]
 
 
 def tune(config: DictConfig) -> str:
@@ -114,15 +119,13 @@ def resolve_world_model(config: DictConfig) -> DictConfig:
     shorten_windows(config, device)
     disable_drift_loss(config)
     resolve_workers(config)
-    numbers = OmegaConf.load(CONFIG_DIR / "model" / f"{size}.yaml")
-    for name in config.model:
-        if OmegaConf.is_missing(config.model, name):
-            config.model[name] = numbers[name]
+    fill_in(config.model, "model")
     if config.model.mixed_precision is None:
         config.model.mixed_precision, reason = parallel.broadcast(choose_mixed_precision(device))
         print(f"mixed precision: {'on' if config.model.mixed_precision else 'off'}, {reason}")
-    if config.model.cuda_graph is None:
-        config.model.cuda_graph = can_capture_graph(config, device)
+    if config.model.cuda_graph is None:  # updates must be alike, and processes exchange no data in them
+        alone = parallel.asked_for() == 1 or config.algorithm == "latent_ppo"
+        config.model.cuda_graph = device.type == "cuda" and alone and config.model.imagination_every == 1
         if config.model.cuda_graph:
             print("updates: replayed as one CUDA graph (model.cuda_graph=null)")
     print_tuned(config)
@@ -154,10 +157,7 @@ def head_of(file: Path) -> list[str]:
 
 
 def changed_from_tuned(config: DictConfig, files: list[Path]) -> list[str]:
-    """Return ``setting=value (tuned value)`` for each setting of the group `tuned` with another value here.
-
-    These are the settings that its files name, and those in which it differs from ``tuned=none``.
-    """
+    """Return ``setting=value (tuned value)`` for each setting that differs here from what `tuned` chooses."""
     named = {name for file in files if file.exists() for name in settings_of(cast(DictConfig, OmegaConf.load(file)))}
     running = GlobalHydra.instance().is_initialized()  # in a recipe
     with nullcontext() if running else hydra.initialize_config_dir(str(CONFIG_DIR), version_base="1.3"):
@@ -201,9 +201,3 @@ def disable_drift_loss(config: DictConfig) -> None:
     if config.loss.drift_scale and any(reasons.values()):
         config.loss.drift_scale = 0.0
         print(f"policy drift penalty: off, because {' and '.join(name for name, holds in reasons.items() if holds)}")
-
-
-def can_capture_graph(config: DictConfig, device: torch.device) -> bool:
-    """Return whether updates can be captured as a CUDA graph: all are alike, and processes exchange no data in them."""
-    alone = parallel.asked_for() == 1 or config.algorithm == "latent_ppo"
-    return device.type == "cuda" and alone and config.model.imagination_every == 1

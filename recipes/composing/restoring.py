@@ -107,13 +107,7 @@ class Restored:
 
 
 def restore(config: FlightConfig) -> Restored:
-    """Restore the policy of a checkpoint, for the race that the configuration names.
-
-    Raises:
-        FileNotFoundError: there is no such checkpoint or agent, or an agent lacks a file.
-        ValueError: it was not trained to race, lacks the requested weights, or the device is not available.
-        TrackError: there is no such track, or no such decoys on it.
-    """
+    """Restore the policy of a checkpoint or agent, for the race that the configuration names."""
     started, machine = time.monotonic(), provenance()
     device = choose_device(config.device)
     checkpoint = find_trained(config.checkpoint)
@@ -149,11 +143,7 @@ def restore(config: FlightConfig) -> Restored:
 def restore_learner(
     config: RunConfig, checkpoint: Path, device: torch.device, weights: str = "auto"
 ) -> tuple[Learner, dict[str, int]]:
-    """Restore the learner of a run's checkpoint, and the run's counters.
-
-    Raises:
-        ValueError: the checkpoint does not have the requested weights.
-    """
+    """Restore the learner of a run's checkpoint with the requested weights, and the run's counters."""
     chosen = choose_weights(weights, kept_weights(load_state(checkpoint, "learner")[0]), checkpoint)
     if isinstance(config, WorldModelRunConfig):
         config.model.cuda_graph = False

@@ -27,11 +27,7 @@ def trained_config(run_dir: Path) -> RunConfig:
 
 
 def saved_config(run_dir: Path) -> DictConfig:
-    """Read the resolved configuration that a run was last trained with; settings that it lacks get their defaults.
-
-    Raises:
-        ValueError: it is damaged, of an unknown algorithm, or has a setting that this version does not have.
-    """
+    """Read the resolved configuration that a run was last trained with; settings that it lacks get their defaults."""
     path = RunDirectory(run_dir).config
     saved = read_yaml(path, DictConfig)
     if (algorithm := str(saved.get("algorithm"))) not in RECIPES:
@@ -47,11 +43,9 @@ def saved_config(run_dir: Path) -> DictConfig:
 
 
 def read_yaml(path: Path, kind: type[Config]) -> Config:
-    """Read a YAML file that a run wrote.
+    """Read a YAML file that a run wrote; refuse one that is damaged, of another kind, or contains interpolations.
 
-    Raises:
-        ValueError: it is damaged, of another kind, or contains interpolations. A run writes none, but in a file from a
-            stranger ``${oc.env:NAME}`` would read this machine's environment.
+    A run writes none, but in a file from a stranger ``${oc.env:NAME}`` would read this machine's environment.
     """
     try:
         content = OmegaConf.load(path)
@@ -60,7 +54,7 @@ def read_yaml(path: Path, kind: type[Config]) -> Config:
     if not isinstance(content, kind) or (kind is DictConfig and not content):
         raise ValueError(f"{path} is damaged: it holds no {'list' if kind is ListConfig else 'settings'}.")
     if isinstance(content, DictConfig):
-        for name, value in flatten(cast(dict[str, Any], OmegaConf.to_container(content, resolve=False))):
+        for name, value in settings_of(content).items():
             if "${" in str(value):
                 shown = shortened(f"{name}: {value}")
                 raise ValueError(f"{path}: {shown}. A saved configuration must contain plain values, no references.")
@@ -70,11 +64,10 @@ def read_yaml(path: Path, kind: type[Config]) -> Config:
 def restore_saved_settings(config: DictConfig, saved: DictConfig, given: Collection[str]) -> None:
     """Set a composed configuration to the saved values, except `MACHINE_SETTINGS` and settings that are given now.
 
-    So a resumed run keeps its settings, even if a later version has other defaults; but none once a group `tuned` or
-    `budget` is given.
+    None is kept once a group `tuned` or `budget` is given.
     """
     if {"tuned", "budget"}.isdisjoint(given):
-        for name, value in flatten(cast(dict[str, Any], OmegaConf.to_container(saved))):
+        for name, value in settings_of(saved).items():
             is_given = any(name == other or name.startswith(f"{other}.") for other in given)
             if not is_given and name not in MACHINE_SETTINGS:
                 OmegaConf.update(config, name, value)

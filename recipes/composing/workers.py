@@ -31,11 +31,7 @@ SEEDS_APART = 1_000_000
 
 
 def share_of(config: WorldModelRunConfig) -> WorldModelRunConfig:
-    """Return this process's share of a resolved and checked configuration; a single process has all of it.
-
-    Raises:
-        ValueError: a setting cannot be divided equally, or there are too few devices.
-    """
+    """Return this process's share of a resolved and checked configuration; a single process has all of it."""
     processes = parallel.num_processes()
     if processes == 1:
         return config
@@ -92,11 +88,7 @@ def make_own_env(config: WorldModelRunConfig) -> Environment:
 
 
 def make_rollouts(config: WorldModelRunConfig, env: Environment, learner: WorldModelLearner) -> Rollouts:
-    """Make the source of rollouts: a collector in this process, or workers.
-
-    Raises:
-        ValueError: workers cannot be started; the message says what was found.
-    """
+    """Make the source of rollouts: a collector in this process, or workers."""
     policy = learner.policy()
     if config.collector is CollectorKind.ray:
         return make_workers(config, env, policy)
@@ -105,7 +97,10 @@ def make_rollouts(config: WorldModelRunConfig, env: Environment, learner: WorldM
 
 def make_workers(config: WorldModelRunConfig, env: Environment, policy: DreamerPolicy) -> RayRollouts:
     """Start workers on a Ray cluster, each with its share of the worlds."""
-    asked, workers, own = config.workers, cast(int, config.num_workers), share_of_worker(config)
+    asked, workers, own = config.workers, cast(int, config.num_workers), copy.deepcopy(config)
+    own.env.num_envs = config.env.num_envs // workers
+    own.device = "cpu"  # where its policy is made; the collector moves it to the worker's device
+    own.env.device = worlds_device(torch.device(asked.device), config.env)
     print(
         f"workers: {workers} on Ray (workers.address={asked.address}), each with {own.env.num_envs} worlds on "
         f"{own.env.device}, {asked.cpus:g} CPUs and {asked.gpus:g} GPUs; weights at most {config.weight_interval:,} "
@@ -116,33 +111,13 @@ def make_workers(config: WorldModelRunConfig, env: Environment, policy: DreamerP
         agent = make_agent(own, Interface.of(env))  # its weights come with the first request
     flying = DreamerPolicy(agent.world_model, agent.actor)
     joined = ray_cluster.join(asked.address)
+    worlds, frames = own.env.device, own.env.num_envs * config.rollout_steps
+    make_worlds = partial(make_worker_env, own, flying.make_primer())
     collector = ray_cluster.start_workers(
-        partial(make_worker_env, own, flying.make_primer()),
-        flying,
-        workers=workers,
-        share=asked,
-        env_device=own.env.device,
-        frames=own.env.num_envs * config.rollout_steps,
-        seed=config.seed,
+        make_worlds, flying, workers=workers, share=asked, env_device=worlds, frames=frames, seed=config.seed
     )
-    return RayRollouts(
-        collector,
-        policy,
-        env,
-        SYNCED_RACE_ATTRIBUTES if is_race(config) else (),
-        weight_interval=config.weight_interval,
-        patience=asked.patience,
-        leaves=joined,
-    )
-
-
-def share_of_worker(config: WorldModelRunConfig) -> WorldModelRunConfig:
-    """Return the configuration of one worker."""
-    own = copy.deepcopy(config)
-    own.env.num_envs = config.env.num_envs // cast(int, config.num_workers)
-    own.device = "cpu"  # where its policy is made; the collector moves it to the worker's device
-    own.env.device = worlds_device(torch.device("cuda" if config.workers.gpus else "cpu"), config.env)
-    return own
+    synced, oldest = SYNCED_RACE_ATTRIBUTES if is_race(config) else (), config.weight_interval
+    return RayRollouts(collector, policy, env, synced, weight_interval=oldest, patience=asked.patience, leaves=joined)
 
 
 def make_worker_env(config: WorldModelRunConfig, primer: TensorDictPrimer) -> TransformedEnv:

@@ -18,7 +18,7 @@ from dreamer_racing.export.onnx_actor import read_contract
 from dreamer_racing.export.shipped_agent import FILES, ShippedAgent, is_agent
 from dreamer_racing.training.directory import RunDirectory, latest_checkpoint
 from dreamer_racing.training.publishing import write_checksums
-from tests.running_recipes import ROOT, UNDRAWN, recipe, recipe_module
+from tests.running_recipes import ROOT, UNDRAWN, completed, recipe, recipe_module
 
 pytest.importorskip("onnxscript")
 pytest.importorskip("onnxruntime")
@@ -56,8 +56,7 @@ def agent(run_dir: Path) -> Path:
     assert other.returncode == 2 and "evaluation of other weights" in other.stderr, "trained, not averaged ones"
     averaged = recipe("evaluate", f"checkpoint={run_dir}", *EVALUATION, cwd=run_dir.parent)
     assert averaged.returncode == 0 and "weights: averaged (weights=auto)" in averaged.stdout, averaged.stderr
-    done = recipe(*command, f"evaluation={run_dir}/evaluation_2/evaluation.json", cwd=run_dir.parent)
-    assert done.returncode == 0, done.stderr
+    completed(*command, f"evaluation={run_dir}/evaluation_2/evaluation.json", cwd=run_dir.parent)
     return folder
 
 
@@ -81,14 +80,12 @@ def test_an_agent_says_where_it_comes_from(agent: Path, run_dir: Path) -> None:
 
 @pytest.mark.slow
 def test_an_agent_is_flown_evaluated_and_exported_as_its_run_is(agent: Path, run_dir: Path, tmp_path: Path) -> None:
-    flown = recipe("fly", f"agent={agent}", "run_dir=fly", cwd=tmp_path)
-    assert flown.returncode == 0, flown.stderr
+    flown = completed("fly", f"agent={agent}", "run_dir=fly", cwd=tmp_path)
     assert all(words in flown.stdout for words in ("gates per episode", "laps  ", "finished  ", "mine on circle"))
     assert {path.name for path in (tmp_path / "fly").iterdir()} == {
         "evaluation.json", "top_down.png", "onboard.mp4", "onboard.gif", "flight_trajectory.csv", "flight_onboard.npz",
     }  # fmt: skip
-    done = recipe("evaluate", f"checkpoint={agent}", *EVALUATION, cwd=tmp_path, before=UNDRAWN)
-    assert done.returncode == 0, done.stderr
+    completed("evaluate", f"checkpoint={agent}", *EVALUATION, cwd=tmp_path, before=UNDRAWN)
     written = json.loads((tmp_path / "runs" / "agent_mine" / "evaluation" / "evaluation.json").read_text())
     expected = json.loads((run_dir / "evaluation_2" / "evaluation.json").read_text())
     assert written["deterministic"] == expected["deterministic"]
@@ -97,8 +94,7 @@ def test_an_agent_is_flown_evaluated_and_exported_as_its_run_is(agent: Path, run
         json.loads((tmp_path / "fly" / "evaluation.json").read_text())["episodes"]
         == (expected["deterministic"]["episodes"])
     )
-    done = recipe("export", f"checkpoint={agent}", cwd=tmp_path)
-    assert done.returncode == 0, done.stderr
+    completed("export", f"checkpoint={agent}", cwd=tmp_path)
     contract = json.loads((tmp_path / "runs" / "agent_mine" / "export" / "contract.json").read_text())
     assert contract["weights_sha256"] == written["provenance"]["weights_sha256"]
     before = {path.name: path.read_bytes() for path in agent.iterdir()}

@@ -11,7 +11,7 @@ import pytest
 from dreamer_racing.evaluation.trajectory import Trajectory, write_flight
 from dreamer_racing.settings import check_settings
 from tests.figures.test_dashboard import circling
-from tests.running_recipes import ROOT, recipe, recipe_module
+from tests.running_recipes import ROOT, completed, recipe, recipe_module
 
 
 def store(stem: Path, flight: Trajectory | None = None, track: str = "circle") -> None:
@@ -132,8 +132,7 @@ def test_a_person_is_told_in_a_paragraph(overrides: list[str], before: str, word
 
 def test_two_runs_become_one_page(runs: Path) -> None:
     pytest.importorskip("viser", reason="needs viser, of the extra dashboard")
-    done = recipe("dashboard", "run=runs/a", "against=runs/b", cwd=runs.parent)
-    assert done.returncode == 0, done.stderr
+    done = completed("dashboard", "run=runs/a", "against=runs/b", cwd=runs.parent)
     assert "tensorboard --logdir_spec a:runs/a,b:runs/b" in done.stdout
     assert "b, deterministic: no value" in done.stdout and "page: runs/a/dashboard.html" in done.stdout
     text = (runs / "a" / "dashboard.html").read_text(encoding="utf-8")
@@ -145,8 +144,7 @@ def test_two_runs_become_one_page(runs: Path) -> None:
 @pytest.mark.slow
 def test_an_agent_that_ships_is_flown_and_lacks_its_critic(tmp_path: Path) -> None:
     pytest.importorskip("viser", reason="needs viser, of the extra dashboard")
-    done = recipe("dashboard", "agent=kidney", cwd=tmp_path)
-    assert done.returncode == 0, done.stderr
+    done = completed("dashboard", "agent=kidney", cwd=tmp_path)
     assert "finished           1 (100%)" in done.stdout and "no value, because the flight has no critic" in done.stdout
     text = (tmp_path / "runs" / "agent_kidney" / "dashboard.html").read_text(encoding="utf-8")
     assert 'data-of="speed"' in text and 'data-of="value"' not in text

@@ -39,12 +39,6 @@ def test_whole_numbers_may_be_written_short_and_paths_as_they_are(argument: str,
     assert recipe_module("composing.entry").normalise_argument(argument) == taken
 
 
-def test_a_setting_of_other_recipes_is_said_to_be_theirs() -> None:
-    words = recipe_module("composing.options").no_such_setting("loss.discount", "ppo")
-    takers = "recipes/dreamer_v3.py and recipes/latent_ppo.py"
-    assert words == f"loss.discount: there is no such setting of recipes/ppo.py; it is for {takers}."
-
-
 @pytest.mark.parametrize("text", ["runs/a-b_1.2", "läufe/k1", "a,b", "it's", "a\\'b\\", "(x)[y]{z}=1#&", "null", "1e3"])
 def test_any_text_can_be_said_to_hydra(text: str) -> None:
     command_line = recipe_module("composing.entry")

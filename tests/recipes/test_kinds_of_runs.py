@@ -19,7 +19,18 @@ from dreamer_racing.envs.simulator.opengl import RendererUnavailableError
 from dreamer_racing.modules import Interface
 from dreamer_racing.training.checkpoint import newest_sound
 from dreamer_racing.training.directory import RunDirectory, env_steps_of, latest_checkpoint
-from tests.running_recipes import AT_THE_END, TINY, UNDRAWN, build, compose, recipe, recipe_module, rows, started
+from tests.running_recipes import (
+    AT_THE_END,
+    TINY,
+    UNDRAWN,
+    build,
+    completed,
+    compose,
+    recipe,
+    recipe_module,
+    rows,
+    started,
+)
 
 SLOW_DISK = """
 import pathlib, time
@@ -150,9 +161,8 @@ def test_a_disk_that_may_not_be_enough_is_said_before_the_run(
 
 
 def test_checkpoints_by_the_clock(tmp_path: Path) -> None:
-    done = recipe("dreamer_v3", *TINY, "checkpoint.minutes=1e-6", "checkpoint.keep=9", "run_dir=run", cwd=tmp_path,
+    completed("dreamer_v3", *TINY, "checkpoint.minutes=1e-6", "checkpoint.keep=9", "run_dir=run", cwd=tmp_path,
                   before=UNDRAWN)  # fmt: skip
-    assert done.returncode == 0, done.stderr
     assert len(list((tmp_path / "run" / "checkpoints").glob("checkpoint-*"))) > 2
 
 
@@ -164,8 +174,7 @@ def test_a_run_in_the_control_suite(tmp_path: Path) -> None:
         pytest.skip(str(error))
     settings = [setting for setting in TINY if not setting.startswith(("track=", "env."))]
     settings += ["env=dmc", "task=cartpole_swingup", "env.episode_steps=40", AT_THE_END]
-    done = recipe("dreamer_v3", *settings, "run_dir=run", cwd=tmp_path)
-    assert done.returncode == 0, done.stderr
+    completed("dreamer_v3", *settings, "run_dir=run", cwd=tmp_path)
     table = rows(tmp_path / "run")
     assert any(row["episode/return"] for row in table), "an episode has 40 records"
     for column in ("evaluation/return_mean", "loss_image", "held_out/image_error"):
@@ -182,16 +191,14 @@ def test_a_run_in_the_control_suite(tmp_path: Path) -> None:
 
 @pytest.mark.slow
 def test_a_run_without_images(tmp_path: Path) -> None:
-    done = recipe("dreamer_v3", *TINY, "env.from_pixels=false", AT_THE_END, "run_dir=run", cwd=tmp_path)
-    assert done.returncode == 0, done.stderr
+    completed("dreamer_v3", *TINY, "env.from_pixels=false", AT_THE_END, "run_dir=run", cwd=tmp_path)
     run_dir = tmp_path / "run"
     table = rows(run_dir)
     for column in ("loss_vector", "evaluation/gates_per_episode", "evaluation/success_rate"):
         assert any(row[column] for row in table), column
     assert "loss_image" not in table[0]
     assert list((run_dir / "plots").glob("*.png")) and list((run_dir / "evaluations").glob("*.json"))
-    done = recipe("evaluate", "checkpoint=run", "episodes=2", "num_envs=2", cwd=tmp_path, before=UNDRAWN)
-    assert done.returncode == 0, done.stderr
+    completed("evaluate", "checkpoint=run", "episodes=2", "num_envs=2", cwd=tmp_path, before=UNDRAWN)
     assert len(json.loads((run_dir / "evaluation" / "evaluation.json").read_text())["stochastic"]["episodes"]) == 2
     done = recipe("dreamer_v3", "resume=run", "env.from_pixels=true", "total_env_steps=9000", cwd=tmp_path)
     assert done.returncode == 2 and "Traceback" not in done.stderr, done.stderr

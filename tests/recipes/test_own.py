@@ -19,7 +19,7 @@ from dreamer_racing.envs.tracks import Track, describe_track, load_track
 from dreamer_racing.export.onnx_actor import read_contract
 from dreamer_racing.hil.flyer import trained_track
 from dreamer_racing.modules import Interface
-from tests.running_recipes import ROOT, TINY, UNDRAWN, compose, recipe, recipe_module
+from tests.running_recipes import ROOT, TINY, UNDRAWN, completed, compose, recipe, recipe_module
 
 
 def written(page: str) -> list[str]:
@@ -44,8 +44,7 @@ def test_an_agent_of_own_losses_is_evaluated_flown_exported_and_drawn_from_elsew
     (home / "my_losses.py").write_text(LOSSES)
     (home / "my_rewards.py").write_text(REWARDS)
     overrides = [*TINY, "tuned=none", *OVERRIDES, f"run_dir={run}", "evaluation.every=100"]
-    trained = recipe("dreamer_v3", *overrides, cwd=home, before=UNDRAWN)
-    assert trained.returncode == 0, trained.stderr
+    trained = completed("dreamer_v3", *overrides, cwd=home, before=UNDRAWN)
     assert "my_losses:Overshooting" in (run / "config.yaml").read_text()
     assert "reward: my_rewards:smooth, minus the curriculum's penalty of body rates" in trained.stdout
     lost = recipe("evaluate", f"checkpoint={run}", "episodes=1", cwd=elsewhere)
@@ -58,8 +57,7 @@ def test_an_agent_of_own_losses_is_evaluated_flown_exported_and_drawn_from_elsew
         ("export", f"checkpoint={run}", f"output={elsewhere / 'export' / 'actor.onnx'}"),
         ("plot", f"runs={run}", f"output={elsewhere / 'figures'}"),
     ):
-        done = recipe(name, *overrides, cwd=elsewhere, before=path)
-        assert done.returncode == 0, f"{name}: {done.stderr}"
+        completed(name, *overrides, cwd=elsewhere, before=path)
     assert json.loads((run / "evaluation" / "evaluation.json").read_text())["deterministic"]["num_episodes"] == 1
     assert list((elsewhere / "flight").rglob("*trajectory.csv"))
     assert (elsewhere / "export" / "actor.onnx").is_file()
@@ -165,33 +163,27 @@ def test_a_run_keeps_the_track_of_a_file_that_is_gone(track: Track, tmp_path: Pa
     file, directory, agent = tmp_path / "tracks" / "mine.yaml", tmp_path / "run", tmp_path / "mine"
     write(track, file)
     short = [override for override in TINY if not override.startswith("track=")]
-    begun = recipe("dreamer_v3", f"track={file}", *short, "run_dir=run", cwd=tmp_path, before=UNDRAWN)
-    assert begun.returncode == 0, begun.stderr
+    completed("dreamer_v3", f"track={file}", *short, "run_dir=run", cwd=tmp_path, before=UNDRAWN)
     write(load_track("circle"), file)
     longer = ["budget=none", "total_env_steps=240"]
-    resumed = recipe("dreamer_v3", "resume=run", *longer, cwd=tmp_path, before=UNDRAWN)
-    assert resumed.returncode == 0, resumed.stderr
+    resumed = completed("dreamer_v3", "resume=run", *longer, cwd=tmp_path, before=UNDRAWN)
     assert f"track: {file} has changed since the run started; the run keeps the old track\n" in resumed.stdout
     # a choice of settings composes everything anew, up to what is noted
     anew = ["tuned=auto", *short, "total_env_steps=280"]
     again = recipe("dreamer_v3", "resume=run", *anew, cwd=tmp_path, before=UNDRAWN)
     assert again.returncode == 0 and "has changed since" in again.stdout, again.stderr
-    of_now = recipe("evaluate", "checkpoint=run", f"track={file}", *EVALUATION, cwd=tmp_path, before=UNDRAWN)
-    assert of_now.returncode == 0, of_now.stderr
+    completed("evaluate", "checkpoint=run", f"track={file}", *EVALUATION, cwd=tmp_path, before=UNDRAWN)
     export = ("export", f"checkpoint={directory}", "agent=mine", "commit=abc1234")
     refused = recipe(*export, cwd=tmp_path)
     assert refused.returncode == 2 and "was flown on another track, or" in refused.stderr, refused.stderr
     file.unlink()
-    evaluated = recipe("evaluate", "checkpoint=run", *EVALUATION, cwd=tmp_path, before=UNDRAWN)
-    assert evaluated.returncode == 0, evaluated.stderr
-    exported = recipe(*export, cwd=tmp_path)
-    assert exported.returncode == 0, exported.stderr
+    completed("evaluate", "checkpoint=run", *EVALUATION, cwd=tmp_path, before=UNDRAWN)
+    completed(*export, cwd=tmp_path)
     contract = read_contract(agent / "contract.json")
     assert (contract["source"]["track"], trained_track(contract)) == ("mine.yaml", track)
     texts = [path.read_text() for path in agent.iterdir() if path.suffix in (".json", ".yaml")]
     assert not any(str(tmp_path) in text for text in texts), "paths of this machine"
-    flown = recipe("fly", f"agent={agent}", cwd=tmp_path)
-    assert flown.returncode == 0, flown.stderr
+    completed("fly", f"agent={agent}", cwd=tmp_path)
 
 
 def test_the_track_of_a_file_is_noted_when_a_run_begins(track: Track, tmp_path: Path) -> None:

@@ -14,7 +14,7 @@ from omegaconf import DictConfig, OmegaConf
 from dreamer_racing.evaluation.image_corruptions import CORRUPTIONS
 from dreamer_racing.training.checkpoint import newest_sound
 from dreamer_racing.training.directory import RunDirectory, env_steps_of, latest_checkpoint
-from tests.running_recipes import CONFIG, SMALL, UNDRAWN, build, recipe, recipe_module, rows
+from tests.running_recipes import CONFIG, SMALL, UNDRAWN, build, completed, recipe, recipe_module, rows
 
 pytestmark = pytest.mark.xdist_group("run")  # one worker makes what these tests share
 
@@ -23,8 +23,7 @@ pytestmark = pytest.mark.xdist_group("run")  # one worker makes what these tests
 def run_dir(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A finished debug run."""
     directory = tmp_path_factory.mktemp("runs") / "first läuf (a=1, b)"
-    done = recipe("dreamer_v3", *SMALL, "evaluation.stochastic=true", f"run_dir='{directory}'", cwd=directory.parent)
-    assert done.returncode == 0, done.stderr
+    done = completed("dreamer_v3", *SMALL, "evaluation.stochastic=true", f"run_dir='{directory}'", cwd=directory.parent)
     assert "device: cpu (device=auto)" in done.stdout and "renderer: " in done.stdout and "GB when full" in done.stdout
     return directory
 
@@ -50,8 +49,7 @@ def test_a_run_leaves_what_it_promises(run_dir: Path) -> None:
 
 def test_resume_continues_where_the_run_stopped(run_dir: Path) -> None:
     before = rows(run_dir)
-    done = recipe("dreamer_v3", f"resume='{run_dir}'", "total_env_steps=500", cwd=run_dir.parent)
-    assert done.returncode == 0, done.stderr
+    done = completed("dreamer_v3", f"resume='{run_dir}'", "total_env_steps=500", cwd=run_dir.parent)
     assert "resumed" in done.stdout
     after = rows(run_dir)
     assert [row["env_steps"] for row in after[: len(before)]] == [row["env_steps"] for row in before]
@@ -65,8 +63,7 @@ def test_a_kill_behind_the_last_checkpoint_costs_nothing_and_adds_nothing(run_di
     shutil.copytree(run_dir, killed)
     (killed / "finished.json").unlink()
     before = (killed / "metrics.csv").read_text()
-    done = recipe("dreamer_v3", f"resume={killed}", cwd=tmp_path, before=UNDRAWN)
-    assert done.returncode == 0, done.stderr
+    completed("dreamer_v3", f"resume={killed}", cwd=tmp_path, before=UNDRAWN)
     assert (killed / "finished.json").exists()
     assert (killed / "metrics.csv").read_text() == before
 
@@ -74,8 +71,7 @@ def test_a_kill_behind_the_last_checkpoint_costs_nothing_and_adds_nothing(run_di
 def test_resuming_a_finished_run_does_nothing_but_say_so(run_dir: Path) -> None:
     before = everything_in(run_dir)
     env_steps = env_steps_of(latest_checkpoint(run_dir))
-    done = recipe("dreamer_v3", f"resume='{run_dir}'", f"total_env_steps={env_steps}", cwd=run_dir.parent)
-    assert done.returncode == 0, done.stderr
+    done = completed("dreamer_v3", f"resume='{run_dir}'", f"total_env_steps={env_steps}", cwd=run_dir.parent)
     assert f"already complete, at {env_steps:,} env_steps" in done.stdout and "continue:" in done.stdout
     said = dict(line.split(":", 1) for line in done.stdout.splitlines() if ":" in line)
     assert all((run_dir / "videos" / f"{env_steps:09d}{policy}.mp4").exists() for policy in ("", "_stochastic"))
@@ -89,8 +85,7 @@ def test_a_finished_run_whose_newest_checkpoint_is_damaged_goes_on(run_dir: Path
     newest = latest_checkpoint(copied)
     env_steps = env_steps_of(newest)
     next(newest.rglob("*-learner/*.pt")).write_bytes(b"")
-    done = recipe("dreamer_v3", "resume=run", f"total_env_steps={env_steps}", cwd=tmp_path, before=UNDRAWN)
-    assert done.returncode == 0, done.stderr
+    done = completed("dreamer_v3", "resume=run", f"total_env_steps={env_steps}", cwd=tmp_path, before=UNDRAWN)
     assert "already complete" not in done.stdout and done.stdout.count("is damaged") == 1
     assert newest_sound(copied) == newest and RunDirectory(copied).finished_env_steps() == env_steps
 
@@ -129,8 +124,7 @@ def test_evaluations_stand_where_they_were_measured(run_dir: Path) -> None:
 
 def test_evaluate_reports_both_policies(run_dir: Path) -> None:
     options = ("episodes=3", "num_envs=2", "start_noise=1")
-    done = recipe("evaluate", f"checkpoint='{run_dir}'", *options, cwd=run_dir.parent)
-    assert done.returncode == 0, done.stderr
+    done = completed("evaluate", f"checkpoint='{run_dir}'", *options, cwd=run_dir.parent)
     report = json.loads((run_dir / "evaluation" / "evaluation.json").read_text())
     assert report["provenance"]["start_noise"] == 1.0
     returns = {episode["reward_sum"] for episode in report["deterministic"]["episodes"]}
@@ -189,9 +183,8 @@ def test_an_evaluation_on_a_full_disk_ends_in_a_line(run_dir: Path, tmp_path: Pa
 
 @pytest.mark.slow
 def test_the_full_protocol(run_dir: Path, tmp_path: Path) -> None:
-    done = recipe("evaluate", f"checkpoint='{run_dir}'", "protocol=full", "episodes=2", "num_envs=2", "video_steps=20",
-                  "run_dir=full", cwd=tmp_path)  # fmt: skip
-    assert done.returncode == 0, done.stderr
+    options = ("protocol=full", "episodes=2", "num_envs=2", "video_steps=20", "run_dir=full")
+    done = completed("evaluate", f"checkpoint='{run_dir}'", *options, cwd=tmp_path)
     assert "asks for 100 episodes" in done.stdout
     report = json.loads((tmp_path / "full" / "evaluation.json").read_text())
     assert all(len(report[policy]["episodes"]) == 2 for policy in ("deterministic", "stochastic"))
@@ -211,8 +204,7 @@ def test_the_full_protocol(run_dir: Path, tmp_path: Path) -> None:
 @pytest.mark.slow
 def test_the_perception_report(run_dir: Path, tmp_path: Path) -> None:
     options = ["episodes=1", "num_envs=1", "run_dir=seen"]
-    done = recipe("perception", f"checkpoint='{run_dir}'", "track=figure8", *options, cwd=tmp_path)
-    assert done.returncode == 0, done.stderr
+    completed("perception", f"checkpoint='{run_dir}'", "track=figure8", *options, cwd=tmp_path)
     report = json.loads((tmp_path / "seen" / "perception.json").read_text())
     assert set(report["flights"]) == {"without decoys", "with decoys"}
     for flights in report["flights"].values():

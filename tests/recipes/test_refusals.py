@@ -180,13 +180,14 @@ def test_settings_that_nothing_reads_are_refused(overrides: list[str], words: st
         ("latent_ppo", "loss.return_decay=0.9", "dreamer_v3"),
         ("latent_ppo", "loss.continuation=false", "dreamer_v3"),
         ("latent_ppo", "sac.batch_size=2", "sac"),
+        ("ppo", "loss.discount=0.9", "dreamer_v3.py and recipes/latent_ppo"),
     ],
 )
 def test_a_setting_of_another_algorithm_is_refused_with_the_recipe_that_takes_it(
     name: str, setting: str, other: str
 ) -> None:
-    key = setting.partition("=")[0]
-    with pytest.raises(ValueError, match=rf"{key}: there is no such setting of .*{name}.py; it is for .*{other}.py"):
+    words = f"{setting.partition('=')[0]}: there is no such setting of recipes/{name}.py; it is for recipes/{other}.py."
+    with pytest.raises(ValueError, match=f"^{re.escape(words)}$"):
         recipe_module("composing.options").check_arguments(name, [setting])
 
 

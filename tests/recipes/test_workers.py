@@ -17,7 +17,7 @@ from dreamer_racing import parallel
 from dreamer_racing.experience.ray_rollouts import RayRollouts, WorkerError
 from dreamer_racing.experience.replay_place import ReplayPlace
 from dreamer_racing.training.directory import latest_checkpoint
-from tests.running_recipes import ROOT, TINY, compose, open_session, recipe, recipe_module, rows
+from tests.running_recipes import ROOT, TINY, completed, compose, open_session, recipe_module, rows
 
 SETTINGS = [
     *TINY, "tuned=race", "model=debug", "model.batch_size=4", "env.from_pixels=false", "loss.ppo.steps=64",
@@ -72,8 +72,7 @@ def test_a_run_outlives_a_worker_and_goes_on_with_workers_or_without(
     ages = [float(row["collect/weights_age"]) for row in rows(tmp_path)[9:] if row["collect/weights_age"]]
     assert ages and all(0 < age <= 64 for age in ages)
 
-    done = recipe("latent_ppo", f"resume={tmp_path}", "collector=local", "total_env_steps=480", cwd=tmp_path.parent)
-    assert done.returncode == 0, done.stderr
+    done = completed("latent_ppo", f"resume={tmp_path}", "collector=local", "total_env_steps=480", cwd=tmp_path.parent)
     assert "workers: none (collector=local); ignored: num_workers=1, workers.patience=120.0\n" in done.stdout
     assert "collector=local (was ray)" in done.stdout
     assert f"at 416 env_steps, {session.counters['updates']:,} updates" in done.stdout, "all that was learned"
@@ -128,8 +127,7 @@ def test_two_processes_are_stopped_by_a_signal_and_one_goes_on(tmp_path: Path) -
     assert "journal" in manifest["components"] and not {"journal", "learner", "counters"} & own.keys()
     assert OmegaConf.load(run_dir / "config.yaml").env.num_envs == 4, "the configuration is of all"
 
-    done = recipe("latent_ppo", "resume=run", f"total_env_steps={env_steps + 64}", cwd=tmp_path)
-    assert done.returncode == 0, done.stderr
+    done = completed("latent_ppo", "resume=run", f"total_env_steps={env_steps + 64}", cwd=tmp_path)
     assert "saved by another number of processes (2 there, 1 here)" in done.stdout
     assert f"resumed run at {env_steps:,} env_steps" in done.stdout
     assert int(rows(run_dir)[-1]["env_steps"]) == env_steps + 64
