@@ -20,7 +20,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from composing.building import serialize_track_file, shared_env_arguments
+from composing.building import shared_env_arguments
 from composing.entry import as_override, override_key, override_value, plain_errors, recipe
 from composing.options import command
 from composing.saved import trained_config
@@ -106,8 +106,6 @@ def export(config: ExportConfig) -> None:
         raise ValueError(f"{checkpoint} was trained by {trained.algorithm}; exported are dreamer_v3 and latent_ppo.")
     if not is_race(trained):
         raise ValueError(f"{checkpoint} was trained on {trained.task}; this recipe exports actors that race.")
-    if trained.track_description is None:  # also for runs from before it was noted
-        trained.track_description = serialize_track_file(trained.track)
     if trained.env.vector is not None:
         raise ValueError(
             f"{checkpoint} was trained with env.vector={trained.env.vector}, which reads the simulator's state, "

@@ -180,8 +180,7 @@ def replay(config: HilConfig) -> int:
     assert config.replay is not None, "checked"
     flight = Flight(Path(config.replay))
     try:
-        written = {"lift": 0.0, **flight.about["config"]}  # older flights had no lift
-        flown = OmegaConf.to_object(OmegaConf.merge(OmegaConf.structured(HilConfig), written))
+        flown = OmegaConf.to_object(OmegaConf.merge(OmegaConf.structured(HilConfig), flight.about["config"]))
     except (KeyError, TypeError, OmegaConfBaseException) as error:
         raise ValueError(
             f"replay={config.replay} was flown with settings that this version does not know "

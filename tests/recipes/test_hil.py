@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import socket
-from contextlib import ExitStack, closing
+from contextlib import ExitStack
 
 import pytest
 
@@ -259,30 +259,6 @@ def test_a_flight_depends_on_no_file_of_its_track(tmp_path, capsys):
     path.unlink()
     assert hil.replay(hil.HilConfig(replay=str(tmp_path / "run"))) == 0
     assert "does not contain its track" not in capsys.readouterr().out
-
-
-def test_a_flight_of_old_is_not_lifted_when_it_is_played_back(tmp_path):
-    """It stands armed for two seconds, as flights might without a lift, of which its recording says nothing."""
-    config = hil.HilConfig(actor="circle", lift=0.0, arm=True)
-    flyer, _ = hil.make_flyer(config)
-    written = hil.as_json(config)
-    del written["lift"]
-    armed = 0
-    with (
-        closing(hil.make_chain(config, flyer, hil.load_track("circle"))) as chain,
-        FlightRecorder(tmp_path / FILE, {"config": written, "track": "circle"}) as recorder,
-    ):
-        turned = 0.5**0.5
-        for count in range(70):
-            now = 10.0 + 0.04 * count
-            pose = [4, -2.5, 1.35, turned, 0, 0, turned, *[0] * 6]
-            message = {"received": [[now, count, now, *pose]], "operator": [count > 8, False], "overrun": 0}
-            inputs = read_inputs({"time": now, **message})
-            outputs = chain.tick(inputs)
-            armed += outputs.verdict.command.armed
-            recorder.tick(now, {"in": describe_inputs(inputs), "out": describe_outputs(outputs)})
-    assert armed > 50
-    assert hil.replay(hil.HilConfig(replay=str(tmp_path))) == 0
 
 
 def test_a_replay_says_at_which_tick_it_parts(tmp_path, capsys):
