@@ -70,9 +70,14 @@ def compose(recipe_name: str, *overrides: str) -> DictConfig:
         return hydra.compose(recipe_name, overrides=list(overrides))
 
 
+def run_config(*overrides: str, name: str = "dreamer_v3") -> Any:
+    """The configuration of a run as its recipe resolves it."""
+    return OmegaConf.to_object(recipe_module(name).resolve(compose(name, *overrides)))
+
+
 def open_session(*overrides: str, name: str = "dreamer_v3") -> tuple[Any, Session]:
-    """The configuration of a run as its recipe resolves it, and a session for it."""
-    config = OmegaConf.to_object(recipe_module(name).resolve(compose(name, *overrides)))
+    """The configuration of a run, and a session for it."""
+    config = run_config(*overrides, name=name)
     return config, recipe_module("composing.launching").open_session(config, list(overrides))
 
 

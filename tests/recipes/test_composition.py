@@ -15,7 +15,7 @@ from dreamer_racing.figures.runs import flatten
 from dreamer_racing.modules import Interface
 from dreamer_racing.training.episodes import GatePassRate
 from dreamer_racing.training.schedule import DreamerV3ScheduleConfig, Schedule
-from tests.running_recipes import CONFIG, EXPERIMENTS, build, compose, prepared, recipe_module
+from tests.running_recipes import CONFIG, EXPERIMENTS, build, compose, prepared, recipe_module, run_config
 
 
 @pytest.mark.parametrize("path", sorted(CONFIG.glob("*/*.yaml")), ids=lambda path: f"{path.parent.name}={path.stem}")
@@ -72,8 +72,7 @@ def test_an_algorithm_without_a_learner_is_a_defect_that_says_so() -> None:
 
 
 def test_decoys_are_a_config_group() -> None:
-    arena, dreamer = recipe_module("composing.building"), recipe_module("dreamer_v3")
-    config = OmegaConf.to_object(dreamer.resolve(compose("dreamer_v3", "track=figure8", "+decoys=paper")))
+    arena, config = recipe_module("composing.building"), run_config("track=figure8", "+decoys=paper")
     assert arena.shared_env_arguments(config)["track"] == load_track("figure8_decoys")
     config.track = "circle"
     with pytest.raises(ValueError, match=r"decoys=paper is for track=figure8; track 'circle'"):
@@ -267,7 +266,7 @@ def test_a_run_with_a_setting_of_another_version_is_refused_by_its_name(tmp_path
 
 def test_the_control_suite_is_evaluated_in_images_of_the_size_trained_on():
     overrides = ["env=dmc", "task=cartpole_swingup", "env.image_size=96", "model=debug", "device=cpu", "seed=3"]
-    config = OmegaConf.to_object(recipe_module("dreamer_v3").resolve(compose("dreamer_v3", *overrides)))
+    config = run_config(*overrides)
     evaluated = recipe_module("composing.building").make_suite(config, 1, 4)
     assert evaluated.observation_spec["pixels"].shape == (1, 96, 96, 3)
     evaluated.close()
@@ -276,7 +275,7 @@ def test_the_control_suite_is_evaluated_in_images_of_the_size_trained_on():
 def test_ramps_by_gates_follow_passed_gates_and_not_the_run():
     overrides = ["tuned=none", "model=debug", "device=cpu", "schedule.min_std.to=0.05", "schedule.min_std.begin=0.5"]
     overrides += ["schedule.min_std.end=0.7", "schedule.min_std.by=passes", "total_env_steps=100000"]
-    config = OmegaConf.to_object(recipe_module("dreamer_v3").resolve(compose("dreamer_v3", *overrides)))
+    config = run_config(*overrides)
     config.check()
     schedule = Schedule(config.schedule, config.scheduled, config.total_env_steps)
     schedule.pass_rate = GatePassRate(num_gates=1)
@@ -290,7 +289,7 @@ def test_a_ramp_with_the_name_of_a_number_of_the_losses_moves_it():
     overrides = ["tuned=none", "model=debug", "device=cpu", "env.from_pixels=false"]
     overrides += [f"schedule.{name}.to=0.5" for name in (*names, "learning_rates", "world_model_rate")]
     overrides += ["schedule.imagination_horizon.to=2"]
-    config = OmegaConf.to_object(recipe_module("dreamer_v3").resolve(compose("dreamer_v3", *overrides)))
+    config = run_config(*overrides)
     schedule = Schedule(config.schedule, config.scheduled, config.total_env_steps)
     begin, end = map(schedule.at, (0, config.total_env_steps))
     own = {"rates": 1.0, "world_model_rate": 1.0, "imagination_horizon": config.model.imagination_horizon}
@@ -321,8 +320,7 @@ def test_a_run_begins_with_the_weights_that_restoring_makes_before_it_loads_any(
     """What trains and what restores a learner make it alike."""
     overrides = ["tuned=none", "model=debug", "device=cpu", "env.from_pixels=false", "loss=informed", "seed=7"]
     overrides += ["loss.critic=state", "loss.min_std=0.2", "env.num_envs=2", f"run_dir={tmp_path / 'run'}"]
-    recipe, learners = recipe_module("latent_ppo"), recipe_module("composing.building")
-    config = OmegaConf.to_object(recipe.resolve(compose("latent_ppo", *overrides)))
+    learners, config = recipe_module("composing.building"), run_config(*overrides, name="latent_ppo")
     run = prepared(*overrides, name="latent_ppo")
     made = learners.make_learner(config, Interface.of(run.env), config.device).state_dict()
     begun = run.learner.state_dict()
@@ -341,8 +339,7 @@ def test_a_checkpoint_flies_as_it_did_after_its_run_was_made_longer(tmp_path: Pa
     """The networks' bounds of deviations are the checkpoint's; of what it does not hold the schedule tells."""
     overrides = ["tuned=none", "model=debug", "device=cpu", "env.from_pixels=false", "env.num_envs=2", "prefill=32"]
     overrides += ["schedule.max_std.to=0.2", "schedule.discount.to=0.9", f"run_dir={tmp_path / 'run'}"]
-    recipe = recipe_module("dreamer_v3")
-    config = OmegaConf.to_object(recipe.resolve(compose("dreamer_v3", *overrides, "total_env_steps=1000")))
+    config = run_config(*overrides, "total_env_steps=1000")
     run = prepared(*overrides, "total_env_steps=1000")
     run.counters["env_steps"] = 500
     run.learner.adjust(max_std=0.3)

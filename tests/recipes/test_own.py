@@ -19,7 +19,7 @@ from dreamer_racing.envs.tracks import Track, describe_track, load_track
 from dreamer_racing.export.onnx_actor import read_contract
 from dreamer_racing.hil.flyer import trained_track
 from dreamer_racing.modules import Interface
-from tests.running_recipes import ROOT, TINY, UNDRAWN, completed, compose, recipe, recipe_module
+from tests.running_recipes import ROOT, TINY, UNDRAWN, completed, compose, recipe, recipe_module, run_config
 
 
 def written(page: str) -> list[str]:
@@ -119,22 +119,20 @@ def test_training_and_evaluation_have_them_and_the_run_remembers(folder: Path) -
     ],
 )
 def test_bad_ones_are_refused_before_anything_is_built(folder: Path, own: str, message: str) -> None:
-    dreamer = recipe_module("dreamer_v3")
-    config = OmegaConf.to_object(dreamer.resolve(compose("dreamer_v3", *RUN, f"env.{own}")))
+    config = run_config(*RUN, f"env.{own}")
     with pytest.raises(ValueError, match=message):
         config.check()
 
 
 def test_the_control_suite_has_neither() -> None:
-    dreamer = recipe_module("dreamer_v3")
-    config = OmegaConf.to_object(dreamer.resolve(compose("dreamer_v3", "env=dmc", "model=debug", OWN[0])))
+    config = run_config("env=dmc", "model=debug", OWN[0])
     with pytest.raises(ValueError, match=r"env\.reward=my_own:constant is for races"):
         config.check()
 
 
 def test_what_sees_numbers_of_ones_own_is_not_exported(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     exporting = recipe_module("export")
-    config = OmegaConf.to_object(recipe_module("dreamer_v3").resolve(compose("dreamer_v3", *RUN, *OWN)))
+    config = run_config(*RUN, *OWN)
     monkeypatch.setattr(exporting, "find_trained", lambda name: folder)
     monkeypatch.setattr(exporting, "config_folder", lambda path: path)
     monkeypatch.setattr(exporting, "trained_config", lambda path: config)
@@ -189,12 +187,11 @@ def test_a_run_keeps_the_track_of_a_file_that_is_gone(track: Track, tmp_path: Pa
 def test_the_track_of_a_file_is_noted_when_a_run_begins(track: Track, tmp_path: Path) -> None:
     file = tmp_path / "mine.yaml"
     write(track, file)
-    dreamer = recipe_module("dreamer_v3")
-    config = OmegaConf.to_object(dreamer.resolve(compose("dreamer_v3", f"track={file}", "model=debug")))
+    config = run_config(f"track={file}", "model=debug")
     assert config.saved_track() == track
     file.write_text("gates: []", encoding="utf-8")
     assert config.saved_track() == track
-    built_in = OmegaConf.to_object(dreamer.resolve(compose("dreamer_v3", "track=kidney", "model=debug")))
+    built_in = run_config("track=kidney", "model=debug")
     assert (built_in.saved_track(), built_in.track_description) == (load_track("kidney"), None)
 
 
