@@ -12,7 +12,7 @@ from dreamer_racing.export.shipped_agent import WEIGHTS
 from dreamer_racing.export.weights_file import read_weights
 from tests.running_recipes import ROOT, TINY, build, prepared, recipe_module
 
-NUMBERS = ["env.from_pixels=false", "prefill=64"]
+NUMBERS = [*TINY, "env.from_pixels=false", "prefill=64", "model.average_rate=0.1"]
 AS_SHIPPED = ["tuned=race", "model=cpu_small", "prefill=4000", "total_env_steps=8000", "replay.capacity=20000"]
 
 
@@ -20,7 +20,7 @@ AS_SHIPPED = ["tuned=race", "model=cpu_small", "prefill=4000", "total_env_steps=
 def saved(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A run with weights that no other begins with."""
     run_dir = tmp_path_factory.mktemp("runs") / "first"
-    run = prepared(*TINY, *NUMBERS, f"run_dir={run_dir}", "seed=7", "model.average_rate=0.1")
+    run = prepared(*NUMBERS, f"run_dir={run_dir}", "seed=7")
     with torch.no_grad():
         for parameter in (*run.learner.agent.parameters(), *run.learner.averaged.parameters()):
             parameter.add_(0.125)
@@ -37,9 +37,8 @@ def trained(saved: Path, tmp_path: Path) -> Path:
 
 
 def test_all_weights_of_a_run_and_nothing_else(trained: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    run = prepared(*TINY, *NUMBERS, f"run_dir={trained.parent / 'next'}", f"init_from={trained}", "track=figure8",
-               "model.average_rate=0.1")  # fmt: skip
-    first = prepared(f"resume={trained}", *TINY, *NUMBERS, f"run_dir={trained}", "seed=7", "model.average_rate=0.1")
+    run = prepared(*NUMBERS, f"run_dir={trained.parent / 'next'}", f"init_from={trained}", "track=figure8")
+    first = prepared(f"resume={trained}", *NUMBERS, f"run_dir={trained}", "seed=7")
     assert "weights: averaged, of" in capsys.readouterr().out
     for own, there in ((run.learner.agent, first.learner.agent), (run.learner.averaged, first.learner.averaged)):
         theirs = there.state_dict()
@@ -53,14 +52,11 @@ def test_all_weights_of_a_run_and_nothing_else(trained: Path, capsys: pytest.Cap
 def test_a_run_with_a_damaged_configuration_is_refused_by_name(trained: Path) -> None:
     (trained / "config.yaml").write_text("env: {")
     with pytest.raises(ValueError, match=r"first/config\.yaml is damaged"):
-        prepared(
-            *TINY, *NUMBERS, f"run_dir={trained.parent / 'next'}", f"init_from={trained}", "model.average_rate=0.1"
-        )
+        prepared(*NUMBERS, f"run_dir={trained.parent / 'next'}", f"init_from={trained}")
 
 
 def test_a_resumed_run_goes_on_with_its_own_weights(trained: Path) -> None:
-    again = prepared(f"resume={trained}", *TINY, *NUMBERS, f"run_dir={trained}", "model.average_rate=0.1",
-                 "init_from=nowhere")  # fmt: skip
+    again = prepared(f"resume={trained}", *NUMBERS, f"run_dir={trained}", "init_from=nowhere")
     assert again.learner.updates == 11
     again.close()
 
@@ -81,7 +77,7 @@ def test_the_networks_of_an_agent_that_ships(tmp_path: Path, capsys: pytest.Capt
     ("overrides", "words"),
     [
         (
-            [*TINY, *NUMBERS, "init_from=nowhere"],
+            [*NUMBERS, "init_from=nowhere"],
             ["init_from=nowhere: there is no such file or folder", "by name: circle"],
         ),
         ([*TINY, "init_from=kidney"], ["size 'cpu_small'", "size 'debug'"]),
@@ -109,5 +105,5 @@ def test_a_run_at_another_rate_or_of_another_size_is_refused(
     overrides: list[str], words: str, trained: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     with pytest.raises(SystemExit):
-        build(*TINY, *NUMBERS, f"run_dir={trained.parent / 'next'}", f"init_from={trained}", *overrides)
+        build(*NUMBERS, f"run_dir={trained.parent / 'next'}", f"init_from={trained}", *overrides)
     assert words in capsys.readouterr().err
