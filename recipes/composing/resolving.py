@@ -83,7 +83,7 @@ def resolve_baseline(config: DictConfig, num_envs: Mapping[str, int]) -> DictCon
 
 def fill_in(group: DictConfig, folder: str) -> None:
     """Fill in the settings that a group lacks from the file of its size."""
-    numbers = OmegaConf.load(CONFIG_DIR / folder / f"{group.size}.yaml")
+    numbers = cast(DictConfig, OmegaConf.load(CONFIG_DIR / folder / f"{group.size}.yaml"))
     for name in group:
         if OmegaConf.is_missing(group, name):
             group[name] = numbers[name]
