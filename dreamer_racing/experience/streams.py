@@ -205,6 +205,8 @@ class StreamWriter(Writer):
         filled: int64 ``(N,)``, records each stream holds.
     """
 
+    cursor: Tensor
+    filled: Tensor
     _storage: RecordStorage
     _write_count: int
 
