@@ -20,7 +20,7 @@ from measuring import make_parser, print_table, write_json
 from dreamer_racing.export.onnx_actor import read_contract
 from dreamer_racing.hil.betaflight import print_settings, rate_map
 from dreamer_racing.hil.betaflight.firmware import find_firmware
-from dreamer_racing.hil.chain import ChainConfig
+from dreamer_racing.hil.chain import ChainConfig, FlightChain
 from dreamer_racing.hil.flyer import ActorFlyer
 from dreamer_racing.hil.links.link import ChannelLink
 from dreamer_racing.hil.links.sitl import encode_sitl
@@ -28,7 +28,7 @@ from dreamer_racing.hil.safety_limits import SafetyLimits
 from dreamer_racing.hil.sticks import ThrustMap
 from dreamer_racing.plant.delivery import Delivery
 from dreamer_racing.plant.firmware_step import FirmwareStep, Radio, SteppedFirmware
-from dreamer_racing.plant.lock_step import LockStep, make_chain
+from dreamer_racing.plant.lock_step import LockStep
 from dreamer_racing.plant.pilot import PilotFlyer
 from dreamer_racing.plant.vehicle import PlantVehicle
 
@@ -90,7 +90,7 @@ def fly(name: str, track: str, flights: int, firmware: SteppedFirmware | None) -
         step = LockStep(vehicle, delivery) if firmware is None else through(firmware, vehicle, delivery)
         flyer = PilotFlyer(vehicle.track, "faithful") if name == "pilot" else ActorFlyer(AGENTS / name)
         limits = SafetyLimits.of_track(vehicle.track)
-        chain = make_chain(flyer, vehicle, ChainConfig(limits, laps=LAPS, arm=True))
+        chain = FlightChain(flyer, vehicle.track, ChainConfig(limits, laps=LAPS, arm=True))
         top, sleep = [0.0], step.sleep_until
 
         def note(deadline: float, vehicle: PlantVehicle = vehicle, top: list[float] = top, sleep: Any = sleep) -> None:

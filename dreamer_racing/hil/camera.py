@@ -42,7 +42,6 @@ class NoseCamera:
             break
         else:
             raise RendererUnavailableError(" ".join(reasons))
-        self.camera = camera
         tilt = math.radians(camera.tilt)
         self._mount = np.array(camera.position)
         self._up = np.array((-math.sin(tilt), 0.0, math.cos(tilt)))

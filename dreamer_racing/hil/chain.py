@@ -103,9 +103,16 @@ class FlightChain:
     first lifted straight up with growing thrust; the flyer runs at each tick, and is reset until the vehicle rises. If
     no rise is seen within `SafetyLimits.lift_time`, motors are cut.
 
+    Args:
+        flyer: Chooses the setpoints; if it has a camera, that draws the track for it.
+        track: To fly.
+        config: Settings.
+        renderer: As in `NoseCamera`.
+
     Raises:
         ValueError: The latency is out of range, the camera's frame rate does not fit the flyer's rate, or the lift is
             not within its range and safety's limits.
+        RendererUnavailableError: The camera's images cannot be rendered here.
 
     Attributes:
         progress: Counts the gates passed.
@@ -115,20 +122,18 @@ class FlightChain:
         needs_imu: Whether the flyer needs IMU samples.
     """
 
-    def __init__(self, flyer: Flyer, track: Track, config: ChainConfig, camera: NoseCamera | None) -> None:
+    def __init__(self, flyer: Flyer, track: Track, config: ChainConfig, renderer: str = "auto") -> None:
         check_setting("latency", config.latency, LATENCY)
         self.progress = GateProgress(track, config.limits)
         self.clock = PoseClock(config.stamping, config.latency, config.limits.clock_drift_max)
         self.safety = Safety(config.limits)
         self.battery = None if config.battery is None else Battery(config.battery)
-        self._flyer, self._camera, self._config = flyer, camera, config
+        self._flyer, self._config = flyer, config
         self._frame_interval = 1 if flyer.camera is None else frame_interval(flyer.camera, flyer.rate)
         self.needs_imu = bool(getattr(flyer, "needs_imu", False))
         self._newest_imu: ImuReading | None = None  # newest IMU sample
         self._image: np.ndarray | None = None  # shown to the flyer; None before a flight's first
         self._shown = 0  # ticks for which it has been shown
-        drawn = None if camera is None else camera.camera
-        self._mismatch = None if flyer.camera in (None, drawn) else f"its camera is {flyer.camera}, not {drawn}"
         self._gates_in_all = None if config.laps is None else config.laps * track.num_gates
         self._newest: Pose | None = None
         self._flying = False  # whether the vehicle has been armed and has left the start
@@ -141,6 +146,7 @@ class FlightChain:
                 f"lift={config.lift:g}: must be {LIFT_LEAST:g} to {LIFT_MOST:g} times the weight, within "
                 f"limits.thrust_max={config.limits.thrust_max:g} m/s², or 0 if the flyer takes off by itself."
             )
+        self._camera = None if flyer.camera is None else NoseCamera(track, flyer.camera, renderer)
 
     def warm_up(self) -> None:
         """Render and run the flyer once before the first tick, because libraries are slow at first use."""
@@ -172,7 +178,7 @@ class FlightChain:
             operator=inputs.operator,
             arm_requested=self._config.arm,
             # a silent IMU in flight leaves the setpoint out instead: safety holds, then cuts
-            contract_mismatch=self._mismatch if self.safety.armed else self._mismatch or imu_fault,
+            contract_mismatch=None if self.safety.armed else imu_fault,
             loop_overrun=inputs.overrun,
             finish=finish,
             command_dropped=inputs.dropped,

@@ -13,15 +13,8 @@ from dreamer_racing.envs.tracks import Track
 from dreamer_racing.hil.battery import BatteryConfig
 from dreamer_racing.hil.betaflight import LINKS as BETAFLIGHT
 from dreamer_racing.hil.betaflight import rate_map, require_dump
-from dreamer_racing.hil.camera import NoseCamera
 from dreamer_racing.hil.chain import LIFT, ChainConfig, FlightChain
-from dreamer_racing.hil.flyer import (
-    Flyer,
-    check_contract,
-    check_flown_by_betaflight,
-    check_ranges,
-    check_rate_loop,
-)
+from dreamer_racing.hil.flyer import Flyer, check_contract, check_flown_by_betaflight, check_ranges, check_rate_loop
 from dreamer_racing.hil.links import BATTERY_LINKS, LINKS, LinkConfig
 from dreamer_racing.hil.links.sitl import MSP_PORT
 from dreamer_racing.hil.operator import (
@@ -287,8 +280,7 @@ def make_chain(config: HilConfig, flyer: Flyer, track: Track) -> FlightChain:
     settings = ChainConfig(
         limits, stamping_of(config), config.latency, config.laps, config.arm, battery_config(config), config.lift
     )
-    camera = None if flyer.camera is None else NoseCamera(track, flyer.camera, config.renderer)
-    return FlightChain(flyer, track, settings, camera)
+    return FlightChain(flyer, track, settings, config.renderer)
 
 
 def stamping_of(config: HilConfig) -> Stamping:

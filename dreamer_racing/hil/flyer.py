@@ -28,15 +28,12 @@ class Flyer(Protocol):
 
     def reset(self) -> None:
         """Begin a flight with empty memory."""
-        ...
 
     def act(self, pose: Pose, image: np.ndarray | None, target_gate: int) -> Setpoint:
         """Choose a setpoint by the pose, the image (None without a camera) and the index of the next gate."""
-        ...
 
     def prepare(self) -> None:
         """Do the part of the next tick that can be done ahead; called after a command was sent."""
-        ...
 
 
 class ActorFlyer:

@@ -34,11 +34,9 @@ class Inlet(Protocol):
         Raises:
             OSError: The device is gone.
         """
-        ...
 
     def close(self) -> None:
         """Close the socket or device; may be called twice."""
-        ...
 
 
 class UdpInlet:

@@ -50,11 +50,9 @@ class Clock(Protocol):
 
     def now(self) -> float:
         """Return the time, s, of a clock that never jumps."""
-        ...
 
     def sleep_until(self, deadline: float) -> None:
         """Wait until a time; return at once if it is past."""
-        ...
 
 
 class MonotonicClock:

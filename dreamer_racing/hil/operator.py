@@ -46,11 +46,9 @@ class OperatorSource(Protocol):
 
     def poll(self, armed: bool = False) -> Operator:
         """Return the operator's wish, without blocking; ``armed``: whether the vehicle is, since the tick before."""
-        ...
 
     def close(self) -> None:
         """Release the socket or terminal; may be called twice."""
-        ...
 
 
 def encode_operator(sequence: int, operator: Operator) -> bytes:

@@ -50,11 +50,9 @@ class PoseSource(Protocol):
 
     def poll(self) -> list[Received]:
         """Return the packets that arrived since the last call, oldest first, without blocking."""
-        ...
 
     def close(self) -> None:
         """Close the socket or device; may be called twice."""
-        ...
 
 
 def encode_pose(packet: PosePacket) -> bytes:

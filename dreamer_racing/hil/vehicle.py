@@ -73,24 +73,18 @@ class Link(Protocol):
     @property
     def refusal(self) -> str:
         """Why the flight controller does not follow commands, or would not if armed; empty if no reason is known."""
-        ...
 
     def send(self, command: Command) -> bytes:
         """Send a command without blocking; return the bytes sent, none if it was dropped."""
-        ...
 
     def listen(self) -> list[Reading]:
         """Return the battery voltages received since the last call, oldest first, without blocking."""
-        ...
 
     def read_imu(self) -> list[ImuReading]:
         """Return the IMU samples received up to the last `listen`, oldest first; called only if the flyer uses them."""
-        ...
 
     def set_voltage(self, voltage: float) -> None:
         """Convert thrust to throttle by this voltage, V, from now on; no effect if thrust is sent in SI units."""
-        ...
 
     def close(self) -> None:
         """Close the socket or device; may be called twice."""
-        ...

@@ -62,19 +62,15 @@ class Controls(Protocol):
     @property
     def due(self) -> float:
         """When `act` is to be called next, s of physics time."""
-        ...
 
     def act(self, time: float) -> None:
         """Do what is due at a time, s of physics time."""
-        ...
 
     def take(self, data: bytes, time: float) -> bool:
         """Process a datagram; return whether it was accepted."""
-        ...
 
     def summary(self) -> str:
         """Return a phrase on what was received."""
-        ...
 
 
 class CommandReceiver:

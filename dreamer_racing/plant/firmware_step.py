@@ -145,11 +145,7 @@ class FirmwareStep(LockStep):
     """
 
     def __init__(
-        self,
-        vehicle: PlantVehicle,
-        firmware: SteppedFirmware,
-        link: TransportLink,
-        delivery: Delivery | None = None,
+        self, vehicle: PlantVehicle, firmware: SteppedFirmware, link: TransportLink, delivery: Delivery | None = None
     ) -> None:
         super().__init__(vehicle, delivery)
         self._firmware, self._link = firmware, link

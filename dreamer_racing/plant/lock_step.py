@@ -6,9 +6,7 @@ Packets, and the code that reads them, are those of a real flight; only time is 
 from __future__ import annotations
 
 from dreamer_racing.hil.battery import Reading
-from dreamer_racing.hil.camera import NoseCamera
-from dreamer_racing.hil.chain import ChainConfig, FlightChain
-from dreamer_racing.hil.flyer import Flyer
+from dreamer_racing.hil.chain import FlightChain
 from dreamer_racing.hil.imu import ImuReading
 from dreamer_racing.hil.links.udp import CommandPacket, encode_command
 from dreamer_racing.hil.loop import FlightLoop
@@ -123,9 +121,3 @@ class _Operator:
 
     def close(self) -> None:
         pass
-
-
-def make_chain(flyer: Flyer, vehicle: PlantVehicle, config: ChainConfig) -> FlightChain:
-    """Make the flight chain of a flyer on the vehicle's track, with a camera if it needs one."""
-    camera = None if flyer.camera is None else NoseCamera(vehicle.track, flyer.camera)
-    return FlightChain(flyer, vehicle.track, config, camera)

@@ -9,11 +9,11 @@ from multiprocessing import get_context
 from typing import Any, NamedTuple
 
 from dreamer_racing.envs.tracks import Track
-from dreamer_racing.hil.chain import ChainConfig
+from dreamer_racing.hil.chain import ChainConfig, FlightChain
 from dreamer_racing.hil.flyer import Flyer
 from dreamer_racing.hil.safety_limits import SafetyLimits
 from dreamer_racing.plant.delivery import Delivery
-from dreamer_racing.plant.lock_step import LockStep, make_chain
+from dreamer_racing.plant.lock_step import LockStep
 from dreamer_racing.plant.vehicle import Mismatch, PlantVehicle
 
 SWEEPS: dict[str, tuple[float, ...]] = {
@@ -96,7 +96,7 @@ def fly(flyer: Flyer, track: Track, preset: str, sweep: str, value: float, seed:
     vehicle = PlantVehicle(track, preset, mismatch)
     laps = vehicle.track.laps
     limits = SafetyLimits.of_track(vehicle.track, **LIMITS)
-    chain = make_chain(flyer, vehicle, ChainConfig(limits, laps=laps, arm=True))
+    chain = FlightChain(flyer, vehicle.track, ChainConfig(limits, laps=laps, arm=True))
     plant = _Fastest(vehicle, delivery)
     try:
         ended = plant.fly(chain, flyer.rate, LONGEST)

@@ -98,10 +98,7 @@ class PlantVehicle:
     """
 
     def __init__(
-        self,
-        track: str | Track,
-        preset: str | QuadrotorParameters = "faithful",
-        mismatch: Mismatch | None = None,
+        self, track: str | Track, preset: str | QuadrotorParameters = "faithful", mismatch: Mismatch | None = None
     ) -> None:
         self.track = load_track(track)
         nominal = without_randomisation(load_preset(preset))

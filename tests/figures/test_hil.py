@@ -77,7 +77,7 @@ class Flown:
     def fly(self, ticks: int = 600) -> Path:
         limits = SafetyLimits.of_track(CIRCLE, **ACCUSTOMED)
         config = ChainConfig(limits, self.stamping, WIRE, self.laps, self.arm, lift=0.0)  # it flies off by itself
-        chain = FlightChain(Wobble(), CIRCLE, config, None)
+        chain = FlightChain(Wobble(), CIRCLE, config)
         settings = {"actor": "wobble", "track": None, "stamping": self.stamping.value, "latency": WIRE}
         about = {"config": settings, "rate": 1.0 / PERIOD, "contract": {"camera": {"width_px": 64}}, **self.about}
         random = np.random.default_rng(0)
@@ -304,7 +304,7 @@ def test_flights_of_a_few_ticks(tmp_path, ticks):
 
 
 def test_a_flight_without_poses(tmp_path):
-    chain = FlightChain(Wobble(), CIRCLE, ChainConfig(SafetyLimits.of_track(CIRCLE)), None)
+    chain = FlightChain(Wobble(), CIRCLE, ChainConfig(SafetyLimits.of_track(CIRCLE)))
     with FlightRecorder(tmp_path / FILE, {"track": "circle"}) as recorder:
         for index in range(5):
             inputs = Inputs(PERIOD * index, [], Operator(False, False), False)

@@ -7,7 +7,6 @@ import json
 import logging
 import os
 import time
-from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
 from typing import ClassVar
@@ -29,7 +28,7 @@ from dreamer_racing.hil.recording import FILE, Flight, FlightRecorder
 from dreamer_racing.hil.safety import SafetyLimits, State
 from dreamer_racing.hil.vehicle import Command, Pose, Setpoint, hover
 from dreamer_racing.plant.delivery import Delivery
-from dreamer_racing.plant.lock_step import CLOCK_OFFSET, LockStep, make_chain
+from dreamer_racing.plant.lock_step import CLOCK_OFFSET, LockStep
 from dreamer_racing.plant.pilot import PilotFlyer
 from dreamer_racing.plant.vehicle import Mismatch, PlantVehicle
 
@@ -81,7 +80,7 @@ class Watched(LockStep):
 def chain_of(flyer: Flyer, plant: LockStep, laps: int | None = 3, arm: bool = True, **limits: object) -> FlightChain:
     track = plant.plant.vehicle.track
     config = ChainConfig(SafetyLimits.of_track(track, **limits), laps=laps, arm=arm)
-    return make_chain(flyer, plant.plant.vehicle, config)
+    return FlightChain(flyer, track, config)
 
 
 def fly_hovering(plant: Watched, duration: float = 30.0) -> str:
@@ -95,7 +94,7 @@ def test_a_wrong_pose_passes_no_gate():
     beside = beyond + np.array([0.0, 0.0, 3.0])
 
     def passes_after(*ticks: list[np.ndarray]) -> int:
-        chain = FlightChain(Hover(), CIRCLE, ChainConfig(SafetyLimits.of_track(CIRCLE)), None)
+        chain = FlightChain(Hover(), CIRCLE, ChainConfig(SafetyLimits.of_track(CIRCLE)))
         level, still, operator = np.array([1.0, 0.0, 0.0, 0.0]), np.zeros(3), Operator(enable=False, kill=False)
         for index, bunch in enumerate(ticks):
             chain._flying = True
@@ -152,7 +151,7 @@ def test_the_battery_is_heard_in_flight_reckoned_with_and_played_back(tmp_path):
 
     def chain():
         config = ChainConfig(SafetyLimits.of_track(CIRCLE), arm=True, battery=BatteryConfig(voltage=16.0))
-        return make_chain(Hover(), plant.vehicle, config)
+        return FlightChain(Hover(), CIRCLE, config)
 
     plant = Sagging(CIRCLE)
     flying = chain()
@@ -218,7 +217,7 @@ def test_a_slow_camera_is_drawn_at_its_frames_and_shown_between_them(monkeypatch
     see = NoseCamera.see
     monkeypatch.setattr(NoseCamera, "see", lambda self, pose: drawn.append(pose) or see(self, pose))
     flyer = Seeing()
-    chain = make_chain(flyer, plant.plant.vehicle, ChainConfig(SafetyLimits.of_track(CIRCLE), arm=True))
+    chain = FlightChain(flyer, CIRCLE, ChainConfig(SafetyLimits.of_track(CIRCLE), arm=True))
     loop = plant.fly(chain, 50.0, 2.0)
     poses, images = zip(*flyer.seen, strict=True)
     assert len(images) > 20, loop
@@ -230,7 +229,7 @@ def test_a_slow_camera_is_drawn_at_its_frames_and_shown_between_them(monkeypatch
     chain.close()
     Seeing.camera = Camera(32, 32, rate=30.0)
     with pytest.raises(ValueError, match=r"camera_rate=30 Hz: .* 25 or 50 are the nearest"):
-        make_chain(Seeing(), plant.plant.vehicle, ChainConfig(SafetyLimits.of_track(CIRCLE)))
+        FlightChain(Seeing(), CIRCLE, ChainConfig(SafetyLimits.of_track(CIRCLE)))
 
 
 @pytest.mark.parametrize("armed", [True, False])
@@ -464,7 +463,7 @@ def test_until_it_moves_a_vehicle_is_lifted_and_its_flyer_begun_anew(lift):
 
     flyer, plant = Noted(), Watched(CIRCLE)
     config = ChainConfig(SafetyLimits.of_track(CIRCLE, arm_time=0.02), arm=True, lift=lift)
-    chain, shown = make_chain(flyer, plant.vehicle, config), list[Outputs]()
+    chain, shown = FlightChain(flyer, CIRCLE, config), list[Outputs]()
     tick = chain.tick
     chain.tick = lambda inputs: shown.append(tick(inputs)) or shown[-1]
     plant.fly(chain, flyer.rate, 1.5)
@@ -493,7 +492,7 @@ class Scripted:
 
     def __init__(self, lift, **limits):
         chosen = SafetyLimits.of_track(CIRCLE, arm_time=0.02, start_yaw_degrees=0.0, **limits)
-        self.chain = make_chain(Hover(), PlantVehicle(CIRCLE), ChainConfig(chosen, arm=True, lift=lift))
+        self.chain = FlightChain(Hover(), CIRCLE, ChainConfig(chosen, arm=True, lift=lift))
         self.now = 10.0
         for count in range(14):
             outputs = self.tick(enable=count == 13)
@@ -594,13 +593,13 @@ def test_a_lift_that_no_pose_shows_ends_low(hidden, thrust, low, high):
 def test_a_lift_that_lifts_nothing_or_is_clipped_is_refused(lift, limits):
     config = ChainConfig(SafetyLimits.of_track(CIRCLE, **limits), lift=lift)
     with pytest.raises(ValueError, match=rf"lift={lift:g}: must be 1.1 to 1.5 times the weight.*limits.thrust_max="):
-        FlightChain(Hover(), CIRCLE, config, None)
+        FlightChain(Hover(), CIRCLE, config)
 
 
 @pytest.mark.parametrize("latency", [-1, 1.5, np.nan, "0"])
 def test_a_latency_that_is_no_time_is_refused(latency):
     with pytest.raises(ValueError, match=f"latency={latency!r}: must be (a number, )?at least 0 and at most 1"):
-        FlightChain(Hover(), CIRCLE, ChainConfig(SafetyLimits.of_track(CIRCLE), latency=latency), None)
+        FlightChain(Hover(), CIRCLE, ChainConfig(SafetyLimits.of_track(CIRCLE), latency=latency))
 
 
 @pytest.mark.parametrize("name", ["figure8", "kidney"])
@@ -630,12 +629,3 @@ def test_after_a_stall_the_next_tick_is_late_and_those_after_it_are_on_the_grid(
     moments = [moment for moment, _ in plant.sent if 0.97 < moment <= 1.17]
     assert moments == pytest.approx([0.98, 1.0, 1.075, 1.08, 1.1, 1.12, 1.14, 1.16])
     assert [number for number in missed if number] == [3]  # those of 1.02 and 1.04, and that of 1.06 came late
-
-
-def test_images_of_another_camera_are_not_flown_by():
-    flyer, plant = ActorFlyer(AGENTS / "circle"), Watched(CIRCLE)
-    config = ChainConfig(SafetyLimits.of_track(CIRCLE), arm=True)
-    chain = FlightChain(flyer, CIRCLE, config, NoseCamera(CIRCLE, replace(flyer.camera, tilt=0.0)))
-    assert "the actor's contract does not fit" in plant.fly(chain, flyer.rate, 2.0)
-    assert not any(command.armed for _, command in plant.sent)
-    chain.close()

@@ -24,7 +24,7 @@ from dreamer_racing.hil.recording import FILE, Flight, FlightRecorder
 from dreamer_racing.hil.safety_limits import SafetyLimits
 from dreamer_racing.hil.sticks import RateMap, ThrustMap, channels
 from dreamer_racing.hil.vehicle import GRAVITY, Command, Setpoint, hover
-from dreamer_racing.plant.lock_step import LockStep, make_chain
+from dreamer_racing.plant.lock_step import LockStep
 from dreamer_racing.plant.vehicle import PlantVehicle
 
 AGENTS = Path(__file__).parents[2] / "agents"
@@ -258,7 +258,7 @@ class Feeling:
 def make(**limits: float) -> tuple[LockStep, FlightChain]:
     plant = LockStep(PlantVehicle(CIRCLE, "easy"))
     config = ChainConfig(SafetyLimits.of_track(CIRCLE, **limits), arm=True)
-    return plant, make_chain(Feeling(), plant.plant.vehicle, config)
+    return plant, FlightChain(Feeling(), CIRCLE, config)
 
 
 def test_a_flight_is_told_what_the_plant_feels_and_plays_back_bit_for_bit(tmp_path) -> None:

@@ -12,12 +12,12 @@ from hypothesis import strategies as st
 
 from dreamer_racing.envs.tracks import load_track
 from dreamer_racing.hil.attitude import rotation_between, rotation_matrix, turn
-from dreamer_racing.hil.chain import ChainConfig
+from dreamer_racing.hil.chain import ChainConfig, FlightChain
 from dreamer_racing.hil.identify import AMPLITUDES, AXES, IdentificationFlyer, make_schedule
 from dreamer_racing.hil.motion import Odometer, TurnOdometer
 from dreamer_racing.hil.pose_sources.messages import GAP, VelocityEstimator
 from dreamer_racing.hil.safety import SafetyLimits
-from dreamer_racing.plant.lock_step import LockStep, make_chain
+from dreamer_racing.plant.lock_step import LockStep
 from dreamer_racing.plant.vehicle import PlantVehicle
 
 LEVEL = np.array([1.0, 0.0, 0.0, 0.0])
@@ -258,7 +258,7 @@ def test_a_vehicle_flies_its_first_steps_within_a_metre_and_tilts_little() -> No
     plant.sleep_until = watch
     limits = SafetyLimits.of_track(CIRCLE, still_time=3600.0)
     flyer = IdentificationFlyer()
-    chain = make_chain(flyer, plant.plant.vehicle, ChainConfig(limits, arm=True))
+    chain = FlightChain(flyer, CIRCLE, ChainConfig(limits, arm=True))
     assert plant.fly(chain, flyer.rate, 12.0) == "12 s are over"
     flown = np.array(places[200:])
     assert np.abs(flown - (*CIRCLE.start_position[:2], CIRCLE.start_position[2] + 0.3)).max() < 1.0

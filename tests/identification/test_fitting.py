@@ -13,7 +13,7 @@ import torch
 
 from dreamer_racing.envs.drone.parameters import GRAVITY, PRESETS, QuadrotorParameters
 from dreamer_racing.envs.tracks import load_track
-from dreamer_racing.hil.chain import ChainConfig
+from dreamer_racing.hil.chain import ChainConfig, FlightChain
 from dreamer_racing.hil.identify import IdentificationFlyer
 from dreamer_racing.hil.recording import FILE, FlightRecorder
 from dreamer_racing.hil.safety import SafetyLimits
@@ -21,7 +21,7 @@ from dreamer_racing.identification import fitting
 from dreamer_racing.identification.fitting import EVERY, PARAMETERS, Model, apply, fit
 from dreamer_racing.identification.recorded import DT, Recorded, of_flight, read_recorded, stretches
 from dreamer_racing.plant.delivery import Delivery
-from dreamer_racing.plant.lock_step import LockStep, make_chain
+from dreamer_racing.plant.lock_step import LockStep
 from dreamer_racing.plant.vehicle import Mismatch, PlantVehicle
 
 NOMINAL = replace(PRESETS["betaflight"], randomisation=None)
@@ -111,7 +111,7 @@ def fly_in_the_plant(drone: QuadrotorParameters, folder: Path, **mismatch: float
     delivery = Delivery(rate=200.0, jitter=0.002, packet_loss=0.01, position_noise=0.001, attitude_noise=0.003)
     plant, flyer = LockStep(PlantVehicle(track, drone, Mismatch(**mismatch)), delivery), IdentificationFlyer()
     limits = SafetyLimits.of_track(track, still_time=3600.0)
-    chain = make_chain(flyer, plant.plant.vehicle, ChainConfig(limits, arm=True))
+    chain = FlightChain(flyer, track, ChainConfig(limits, arm=True))
     with FlightRecorder(folder / FILE, {"config": {"latency": 0.0}}) as recorder:
         assert plant.fly(chain, flyer.rate, flyer.duration + 3.0, recorder).endswith("s are over")
 

@@ -23,7 +23,7 @@ from dreamer_racing.hil.vehicle import Command, Pose
 from dreamer_racing.plant.betaflight_sitl import CONVENTIONS, BetaflightSitl, convention_of, decode_motors, encode_state
 from dreamer_racing.plant.delivery import Delivery
 from dreamer_racing.plant.firmware_step import Radio
-from dreamer_racing.plant.lock_step import LockStep, make_chain
+from dreamer_racing.plant.lock_step import LockStep
 from dreamer_racing.plant.pilot import PilotFlyer
 from dreamer_racing.plant.process import Plant
 from dreamer_racing.plant.vehicle import PlantVehicle
@@ -234,7 +234,7 @@ class SitlStep(LockStep):
 def pilot_on(step: SitlStep, laps: int) -> FlightChain:
     vehicle = step.plant.vehicle
     config = ChainConfig(SafetyLimits.of_track(vehicle.track), laps=laps, arm=True)
-    return make_chain(PilotFlyer(vehicle.track, "faithful"), vehicle, config)
+    return FlightChain(PilotFlyer(vehicle.track, "faithful"), vehicle.track, config)
 
 
 @pytest.mark.parametrize("version", ["2026.6", "before"])

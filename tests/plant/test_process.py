@@ -19,13 +19,7 @@ from dreamer_racing.hil.vehicle import Command, Setpoint, at_rest, hover
 from dreamer_racing.plant import process
 from dreamer_racing.plant.commands import CommandReceiver
 from dreamer_racing.plant.delivery import Delivery
-from dreamer_racing.plant.process import (
-    Plant,
-    ProcessOptions,
-    check_process,
-    fly_in_lock_step,
-    fly_in_real_time,
-)
+from dreamer_racing.plant.process import Plant, ProcessOptions, check_process, fly_in_lock_step, fly_in_real_time
 from dreamer_racing.plant.vehicle import PlantVehicle
 from dreamer_racing.settings import check_settings
 from dreamer_racing.training.signals import GracefulExit

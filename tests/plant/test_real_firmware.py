@@ -23,7 +23,6 @@ from dreamer_racing.hil.sticks import ThrustMap
 from dreamer_racing.hil.vehicle import GRAVITY, Command, Setpoint, at_rest
 from dreamer_racing.plant.betaflight_sitl import CONVENTIONS, convention_of
 from dreamer_racing.plant.firmware_step import FirmwareStep, Radio, SteppedFirmware
-from dreamer_racing.plant.lock_step import make_chain
 from dreamer_racing.plant.pilot import PilotFlyer
 from dreamer_racing.plant.vehicle import PlantVehicle
 from tests.plant.conftest import CONTRACT
@@ -71,7 +70,7 @@ def hover(step: FirmwareStep, rate: float = 100.0) -> None:
 
 def chain_of(step: FirmwareStep, flyer: PilotFlyer | ActorFlyer, laps: int) -> FlightChain:
     vehicle = step.plant.vehicle
-    return make_chain(flyer, vehicle, ChainConfig(SafetyLimits.of_track(vehicle.track), laps=laps, arm=True))
+    return FlightChain(flyer, vehicle.track, ChainConfig(SafetyLimits.of_track(vehicle.track), laps=laps, arm=True))
 
 
 def test_it_is_set_up_as_is_wanted_and_what_it_does_not_know_is_named(set_up: SetUp) -> None:

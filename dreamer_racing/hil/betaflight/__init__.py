@@ -20,12 +20,4 @@ from dreamer_racing.hil.betaflight.settings import (
     wanted_settings,
 )
 
-__all__ = [
-    "LINKS",
-    "Status",
-    "check_dump",
-    "print_settings",
-    "rate_map",
-    "require_dump",
-    "wanted_settings",
-]
+__all__ = ["LINKS", "Status", "check_dump", "print_settings", "rate_map", "require_dump", "wanted_settings"]

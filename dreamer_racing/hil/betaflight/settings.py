@@ -319,13 +319,7 @@ _SIMULATED = tuple(
 )
 _PROFILE = (
     *(
-        Setting(
-            f"f_{axis}",
-            "0",
-            "no feedforward: each command is a step, which it would amplify",
-            default,
-            "profile",
-        )
+        Setting(f"f_{axis}", "0", "no feedforward: each command is a step, which it would amplify", default, "profile")
         for axis, default in (("roll", "120"), ("pitch", "125"), ("yaw", "120"))
     ),
     Setting("dyn_idle_min_rpm", "0", "idle is a fraction of the command, not a speed", "0", "profile", absent=True),

@@ -23,19 +23,15 @@ class Transport(Protocol):
 
     def write(self, data: bytes) -> bool:
         """Send bytes without blocking; return whether all of them were accepted."""
-        ...
 
     def discard(self) -> None:
         """Discard bytes that were written but not sent yet."""
-        ...
 
     def read(self) -> Iterator[tuple[float, bytes]]:
         """Yield the received bytes, as `Inlet.read` does."""
-        ...
 
     def close(self) -> None:
         """Close the socket or device; may be called twice."""
-        ...
 
 
 class TransportLink(ABC):
