@@ -10,33 +10,27 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from types import FrameType
-from typing import Any, Protocol
+from typing import Any, Protocol, TypeVar
 
 import numpy as np
 
 from dreamer_racing.hil.background_worker import BackgroundWorker
-from dreamer_racing.hil.battery import Reading, battery_words
+from dreamer_racing.hil.battery import battery_words
 from dreamer_racing.hil.chain import FlightChain, Inputs, Outputs, describe_inputs, describe_outputs
 from dreamer_racing.hil.operator import Operator, OperatorSource
-from dreamer_racing.hil.pose import PoseSource, Received
+from dreamer_racing.hil.pose import PoseSource
 from dreamer_racing.hil.recording import FlightRecorder
 from dreamer_racing.hil.safety import Reason
-from dreamer_racing.hil.vehicle import Command, Link, at_rest
+from dreamer_racing.hil.vehicle import Link, at_rest
 from dreamer_racing.hil.watchdog import Watchdog
 
+T = TypeVar("T")
 logger = logging.getLogger(__name__)
 
-DISARM_SECONDS = 1.0
-"""s for which disarm frames are sent after the last tick, however the flight ended."""
-
-DISARM_RATE = 50.0
-"""Hz of those frames [choice]."""
-
-LINES_MOST = 64
-"""Log lines that may wait for a terminal or a pipe [choice]; further ones are dropped."""
-
-LINES_PATIENCE = 1.0
-"""s for which the end of a flight waits for these lines [choice]; motors are off by then."""
+DISARM_SECONDS = 1.0  # s for which disarm frames are sent after the last tick, however the flight ended
+DISARM_RATE = 50.0  # Hz of those frames [choice]
+LINES_MOST = 64  # log lines that may wait for a terminal or a pipe [choice]; further ones are dropped
+LINES_PATIENCE = 1.0  # s for which the end of a flight waits for these lines [choice]; motors are off by then
 
 OF_THE_ENABLE = (Reason.NO_ENABLE, Reason.NOT_RELEASED)
 """Reasons that change as the operator's enable comes and goes; they are not logged again each time."""
@@ -226,15 +220,17 @@ class FlightLoop:
 
     def _tick(self, start: float, deadline: float, overrun: int, armed: bool) -> Outputs:
         """Run one tick: inputs → chain → link → recording."""
-        operator = self._ask_operator(armed)
-        heard = self._listen()
+        # What fails gives no enable, a dropped command or no poses, so that safety cuts, or holds and then cuts.
+        operator = self._use("the operator's switch", lambda: self._operator.poll(armed), Operator(False, False))
+        heard = self._use("the link", self._link.listen, None)
         imu = self._link.read_imu() if self._chain.needs_imu else []
         refusal = self._link.refusal
-        inputs = Inputs(start, self._take_poses(), operator, overrun, heard or [], self._dropped, imu, refusal)
+        poses = self._use("the source of poses", self._poses.poll, [])
+        inputs = Inputs(start, poses, operator, overrun, heard or [], self._dropped, imu, refusal)
         outputs = self._chain.tick(inputs)
         if outputs.voltage is not None:
             self._link.set_voltage(outputs.voltage)
-        sent = self._send(outputs.verdict.command)
+        sent = self._use("the link", lambda: self._watchdog.send(outputs.verdict.command), b"")
         self._dropped = not sent or heard is None
         done = self._clock.now()
         self._record_timings(start - deadline, inputs, outputs, done)
@@ -245,43 +241,15 @@ class FlightLoop:
         self.statistics.prepare.append(self._clock.now() - shown)
         return outputs
 
-    def _ask_operator(self, armed: bool) -> Operator:
-        """Return what the operator wants; no enable if the switch fails, so that safety cuts."""
+    def _use(self, part: str, use: Callable[[], T], instead: T) -> T:
+        """Return what a part gives; if it fails, as an unplugged adapter does, log its first error, and return this."""
         try:
-            return self._operator.poll(armed)
+            return use()
         except OSError as error:
-            self._note_broken("the operator's switch", error)
-            return Operator(enable=False, kill=False)
-
-    def _take_poses(self) -> list[Received]:
-        """Return the new poses; none if the source fails, so that safety holds, then cuts."""
-        try:
-            return self._poses.poll()
-        except OSError as error:
-            self._note_broken("the source of poses", error)
-            return []
-
-    def _listen(self) -> list[Reading] | None:
-        """Return the link's voltage readings; None if it fails: the tick's command then counts as dropped, too."""
-        try:
-            return self._link.listen()
-        except OSError as error:
-            self._note_broken("the link", error)
-            return None
-
-    def _send(self, command: Command) -> bytes:
-        """Send a command; if that fails, as with an unplugged adapter, it counts as dropped, so that safety cuts."""
-        try:
-            return self._watchdog.send(command)
-        except OSError as error:
-            self._note_broken("the link", error)
-            return b""
-
-    def _note_broken(self, part: str, error: OSError) -> None:
-        """Log a part's first error."""
-        if part not in self._broken:
-            self._log(logging.ERROR, "%s fails: %s", part, error)
-        self._broken.add(part)
+            if part not in self._broken:
+                self._log(logging.ERROR, "%s fails: %s", part, error)
+            self._broken.add(part)
+            return instead
 
     def _show(self, inputs: Inputs, outputs: Outputs, took: dict[str, float], sent: bytes) -> None:
         """Record and show a tick; a full disk, or a page that fails, must not end a flight."""
