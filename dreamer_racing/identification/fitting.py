@@ -12,6 +12,7 @@ import logging
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
+from itertools import compress
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -26,26 +27,18 @@ from dreamer_racing.identification.recorded import AXES, DT, Recorded, stretches
 
 logger = logging.getLogger(__name__)
 
-STRETCH = 1.1
-"""s of open-loop simulation, from a measured start [choice]: longer ones stray by what is not modelled."""
+STRETCH = 1.1  # s of open-loop simulation, from a measured start [choice]: longer ones stray by what is not modelled
 BURN_IN = 0.2
 """s at its start that are not compared [choice]: the states of filters and integrators are not known there."""
-EVERY = 5
-"""ms between two comparisons."""
-CORRELATED = 0.04
-"""s over which errors are correlated [choice]: they are not noise, but what the model lacks."""
-FLOOR = 0.003
-"""Least assumed error, as a share of the RMS of rates [choice]."""
+EVERY = 5  # ms between two comparisons
+CORRELATED = 0.04  # s over which errors are correlated [choice]: they are not noise, but what the model lacks
+FLOOR = 0.003  # least assumed error, as a share of the RMS of rates [choice]
 OUTLIER = 3.0
 """Standard deviations beyond which an error counts linearly, not squared: recordings have pauses and gusts."""
-TRIMMED_SHARE = 0.1
-"""Share of the largest errors, due to pauses and gusts, that `Fit.errors` leaves out."""
-STEPS = 15
-"""Largest number of Gauss-Newton steps."""
-UNKNOWN_SHARE = 0.5
-"""Share of the prior's standard deviation above which a fitted parameter counts as unknown [choice]."""
-CONVERGED = 0.02
-"""Largest change of a parameter, as a share of its prior's standard deviation, at which the fit ends."""
+TRIMMED_SHARE = 0.1  # share of the largest errors, due to pauses and gusts, that `Fit.errors` leaves out
+STEPS = 15  # largest number of Gauss-Newton steps
+UNKNOWN_SHARE = 0.5  # share of the prior's standard deviation above which a fitted parameter counts as unknown [choice]
+CONVERGED = 0.02  # largest change of a parameter, as a share of its prior's standard deviation, at which the fit ends
 
 
 class Parameter(NamedTuple):
@@ -121,6 +114,9 @@ class Model:
         self._shape = candidates, len(parts)
         num_drones = candidates * len(parts)
         self._quadrotor = Quadrotor(self._drone, num_drones)
+        loop = self._quadrotor.rate_loop
+        assert loop is not None
+        self._loop = loop
         self._qpos = torch.zeros(num_drones, 7, dtype=torch.float64)
         self._qvel, self._force = (torch.zeros(num_drones, 6, dtype=torch.float64) for _ in range(2))
         self._inertia = torch.tensor(self._drone.inertia, dtype=torch.float64)
@@ -145,8 +141,7 @@ class Model:
 
     def fly(self, candidates: Tensor) -> Simulated:
         """Simulate all stretches with candidates (C, P), from the measured rates at their starts on."""
-        quadrotor, loop, (_, stretches_) = self._quadrotor, self._quadrotor.rate_loop, self._shape
-        assert loop is not None
+        quadrotor, (_, stretches_) = self._quadrotor, self._shape
         late = self._set_parameters(candidates)  # (C,) ms
         quadrotor.reset(torch.ones(len(self._qpos), dtype=torch.bool))
         self._begin(len(candidates))
@@ -156,7 +151,7 @@ class Model:
             at = (step - late).clamp(min=0).unsqueeze(1)  # (C, 1)
             quadrotor.setpoints[0] = self._command[at, columns].flatten(0, 1)
             arrived = self._fresh[at, columns].flatten() & (step >= late).repeat_interleave(stretches_)
-            loop.state[:, Row.THROTTLE, 2].masked_fill_(arrived, 0.0)
+            self._loop.state[:, Row.THROTTLE, 2].masked_fill_(arrived, 0.0)
             if step == self._handover:
                 self._store_states()
             self._flight.step(0)
@@ -168,32 +163,26 @@ class Model:
 
     def _begin(self, candidates: int) -> None:
         """Put the drones at the starts of their stretches."""
-        loop = self._quadrotor.rate_loop
-        assert loop is not None
         self._qpos[:, 3:] = torch.tensor((1.0, 0.0, 0.0, 0.0), dtype=torch.float64)
         start = self._rates[0].expand(candidates, -1, -1).reshape(-1, 3)
         self._qvel.zero_()
         self._qvel[:, 3:] = start
         for row in (Row.GYRO_LPF1, Row.GYRO_LPF2, Row.DTERM_LPF1, Row.DTERM_LPF2):
-            loop.state[:, row] = torch.rad2deg(start)
+            self._loop.state[:, row] = torch.rad2deg(start)
         if self._remembered is not None:
-            for kept, remembered in zip((loop.state, self._quadrotor.rotor_speed), self._remembered, strict=True):
+            for kept, remembered in zip((self._loop.state, self._quadrotor.rotor_speed), self._remembered, strict=True):
                 of_all = remembered.repeat(candidates, *[1] * (remembered.ndim - 1))
                 rows = self._follows.repeat(candidates).view(-1, *[1] * (kept.ndim - 1))
                 kept.copy_(torch.where(rows, of_all, kept))
 
     def _store_states(self) -> None:
         """Store controller states and rotor speeds of the first candidate, each for the stretch after its own."""
-        loop = self._quadrotor.rate_loop
-        assert loop is not None
         own = slice(self._shape[1])
-        self._next = loop.state[own].roll(1, 0).clone(), self._quadrotor.rotor_speed[own].roll(1, 0).clone()
+        self._next = self._loop.state[own].roll(1, 0).clone(), self._quadrotor.rotor_speed[own].roll(1, 0).clone()
 
     def _set_parameters(self, candidates: Tensor) -> Tensor:
         """Set the parameters of the drones of candidates (C, P); return the delay of each, (C,) ms."""
-        loop = self._quadrotor.rate_loop
         values = {parameter.name: candidates[:, index] for index, parameter in enumerate(PARAMETERS)}
-        assert loop is not None
         own = torch.ones(len(candidates), len(DroneParameter), 3, dtype=torch.float64)
         for row, gain, axes in ((DroneParameter.P, "p", 3), (DroneParameter.I, "i", 3), (DroneParameter.D, "d", 2)):
             for index, axis in enumerate(AXES[:axes]):
@@ -201,7 +190,7 @@ class Model:
         decay = math.log(self._quadrotor.motor_decay) / values["motor_lag"].exp()
         motors = torch.stack((decay.exp(), (0.5 * decay).exp(), torch.zeros_like(decay)), dim=1)
         own[:, DroneParameter.MOTORS] = motors
-        loop.drone_parameters.copy_(own.repeat_interleave(self._shape[1], 0))
+        self._loop.drone_parameters.copy_(own.repeat_interleave(self._shape[1], 0))
         return ((self._delay + values["delay"]) / DT).round().long().clamp(min=0)
 
 
@@ -225,33 +214,28 @@ def fit(recorded: Recorded, nominal: QuadrotorParameters) -> Fit:
     measured = torch.from_numpy(np.stack([recorded.rates[part] for part in parts], 1))[EVERY - 1 :: EVERY]  # (T, S, 3)
     kept = slice(round(BURN_IN / DT / EVERY), None)
     floor = FLOOR * measured.square().mean((0, 1)).sqrt().clamp(min=0.1)
-    found, before, last = torch.zeros(len(PARAMETERS), dtype=torch.float64), None, None
+    found, before = torch.zeros(len(PARAMETERS), dtype=torch.float64), dict[str, float]()
+    change = torch.zeros_like(found)
     for number in range(STEPS):
+        found = found + change
+        found[-1] = found[-1].clamp(min=-nominal.command_delay)
         simulated = model.fly(found + torch.cat((torch.zeros(1, len(priors)), probes.diag())))
         error = (simulated.rates - measured.unsqueeze(1))[kept]  # (T, C, S, 3)
         rms = _rms(error[:, 0], recorded, parts)
         words = ", ".join(f"{axis} {each:.1%}" for axis, each in rms.items())
         logger.info("identification: step %d, errors %s", number, words)
         before = before or rms
-        change, posterior_deviation, sandwich_deviation = _solve(error, floor, probes, priors, found)
-        last = Step(found.clone(), rms, posterior_deviation, sandwich_deviation, simulated)
+        change, posterior, sandwich = _solve(error, floor, probes, priors, found)
         if (change / priors).abs().max() < CONVERGED:
             break
-        found = found + change
-        found[-1] = found[-1].clamp(min=-nominal.command_delay)
-    assert last is not None
-    assert before is not None
-    return _conclude(last, before, nominal, recorded, parts)
-
-
-class Step(NamedTuple):
-    """A step of the fit."""
-
-    found: Tensor  # (P,)
-    errors: dict[str, float]  # by axis
-    posterior_deviation: Tensor  # (P,) of the posterior
-    sandwich_deviation: Tensor  # (P,) likewise, from differences of stretches
-    simulated: Simulated  # with them, and with each one probed
+    names = [parameter.name for parameter in PARAMETERS]
+    unknown = tuple(compress(names, posterior > UNKNOWN_SHARE * priors))
+    values = {
+        name: each if name == "delay" else math.exp(each) for name, each in zip(names, found.tolist(), strict=True)
+    }
+    thrust = _thrust(simulated.force[:, 0], recorded, parts)
+    deviations = dict(zip(names, sandwich.tolist(), strict=True))
+    return Fit(apply(nominal, values, thrust or 1.0), values, deviations, unknown, rms, before, thrust)
 
 
 def _solve(
@@ -291,23 +275,6 @@ def _rms(error: Tensor, recorded: Recorded, parts: Sequence[slice]) -> dict[str,
     kept = squares[: math.ceil((1.0 - TRIMMED_SHARE) * len(squares))].mean(0).sqrt()
     relative = kept / torch.from_numpy(asked).square().mean(0).sqrt().clamp(min=1e-6)
     return dict(zip(AXES, relative.tolist(), strict=False))
-
-
-def _conclude(
-    last: Step, before: dict[str, float], nominal: QuadrotorParameters, recorded: Recorded, parts: Sequence[slice]
-) -> Fit:
-    """Return the result of a fit from its last step."""
-    unknown = tuple(
-        parameter.name
-        for parameter, each in zip(PARAMETERS, last.posterior_deviation.tolist(), strict=True)
-        if each > UNKNOWN_SHARE * parameter.prior
-    )
-    found = {parameter.name: float(each) for parameter, each in zip(PARAMETERS, last.found, strict=True)}
-    values = {name: each if name == "delay" else math.exp(each) for name, each in found.items()}
-    thrust = _thrust(last.simulated.force[:, 0], recorded, parts)
-    parameters = apply(nominal, values, thrust or 1.0)
-    deviations = dict(zip(found, last.sandwich_deviation.tolist(), strict=True))
-    return Fit(parameters, values, deviations, unknown, last.errors, before, thrust)
 
 
 def _thrust(force: Tensor, recorded: Recorded, parts: Sequence[slice]) -> float | None:

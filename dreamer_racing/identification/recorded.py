@@ -18,8 +18,7 @@ from dreamer_racing.envs.drone.parameters import GRAVITY
 from dreamer_racing.hil.attitude import rotation_matrix
 from dreamer_racing.hil.recording import Flight
 
-DT = 0.001
-"""s, step of the grid."""
+DT = 0.001  # s, step of the grid
 
 AXES = ("roll", "pitch", "yaw", "thrust")
 UNITS = ("rad/s", "rad/s", "rad/s", "m/s²")
@@ -27,16 +26,13 @@ UNITS = ("rad/s", "rad/s", "rad/s", "m/s²")
 FASTEST = 500.0
 """rad/s² beyond which rates have jumped by a reset of the body, not in flight [choice]: small racers reach 440."""
 
-LONGEST_GAP = 0.05
-"""s without a measurement over which nothing is interpolated [choice]."""
+LONGEST_GAP = 0.05  # s without a measurement over which nothing is interpolated [choice]
 
 MIN_EXCITATION = (0.4, 0.4, 0.3, 0.8)
 """Least standard deviation of each axis's commands within a window for it to count as moved, in `UNITS` [choice]:
 below, noise and model errors are as large as the response."""
-MIN_SECONDS = (2.0, 2.0, 3.0, 2.0)
-"""s for which each axis must be moved [choice]: yaw, which is slow, for longer."""
-WINDOW = 1.0
-"""s over which variation is measured [choice]."""
+MIN_SECONDS = (2.0, 2.0, 3.0, 2.0)  # s for which each axis must be moved [choice]: yaw, which is slow, for longer
+WINDOW = 1.0  # s over which variation is measured [choice]
 
 
 @dataclass(frozen=True)
