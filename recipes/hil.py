@@ -39,8 +39,8 @@ from dreamer_racing.hil.configuration import (
     link_config,
     make_chain,
     make_operator,
+    make_pose_source,
     pilot_contract,
-    pose_config,
     stamping_of,
 )
 from dreamer_racing.hil.flyer import ActorFlyer, Flyer, trained_track
@@ -49,7 +49,6 @@ from dreamer_racing.hil.links import make_link
 from dreamer_racing.hil.links.link import TransportLink
 from dreamer_racing.hil.loop import FlightLoop, summary_lines
 from dreamer_racing.hil.pose import PoseSource
-from dreamer_racing.hil.pose_sources import make_poses
 from dreamer_racing.hil.progress import flying_laps
 from dreamer_racing.hil.recording import FILE, TRACK, Flight, FlightRecorder
 from dreamer_racing.hil.view import LiveView
@@ -126,7 +125,7 @@ def prepare(config: HilConfig, opened: ExitStack) -> Prepared:
     opened.callback(chain.close)
     folder = Path(config.run_dir) if config.run_dir else new_run_dir("hil", track.name)
     link = opened.enter_context(closing(make_link(link_config(config, contract, flyer.rate))))
-    poses = opened.enter_context(closing(make_poses(pose_config(config))))
+    poses = opened.enter_context(closing(make_pose_source(config)))
     operator = opened.enter_context(closing(make_operator(config)))
     recorder = None
     if config.record:

@@ -25,7 +25,8 @@ from dreamer_racing.hil.operator import (
     UdpOperator,
     is_remote_terminal,
 )
-from dreamer_racing.hil.pose_sources import POSE_SOURCES, WITHOUT_VELOCITIES, PoseConfig
+from dreamer_racing.hil.pose import PoseSource
+from dreamer_racing.hil.pose_sources import POSE_SOURCES, WITHOUT_VELOCITIES, make_poses
 from dreamer_racing.hil.safety import SafetyLimits
 from dreamer_racing.hil.stamping import Stamping
 from dreamer_racing.hil.sticks import FIRST_SWITCH, ThrustMap
@@ -335,18 +336,10 @@ def check_battery(config: HilConfig, thrust: ThrustMap) -> None:
             ) from error
 
 
-def pose_config(config: HilConfig) -> PoseConfig:
-    """Return the settings of the pose source."""
-    return PoseConfig(
-        name=config.pose,
-        host=config.pose_host,
-        port=config.pose_port,
-        device=config.pose_device,
-        baud=config.pose_baud,
-        topic=config.pose_topic,
-        message=config.pose_message,
-        smoothing=config.smoothing,
-    )
+def make_pose_source(config: HilConfig) -> PoseSource:
+    """Open the source of poses."""
+    names = ("pose", "pose_host", "pose_port", "pose_device", "pose_baud", "pose_topic", "pose_message", "smoothing")
+    return make_poses(*(getattr(config, name) for name in names))
 
 
 def make_operator(config: HilConfig) -> OperatorSource:

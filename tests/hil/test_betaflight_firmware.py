@@ -95,11 +95,11 @@ STATUS_4_6 = bytes.fromhex("0000 0000 2300 00000000 00 0000 0000 03 000000 1d 04
 def test_a_status_is_read_and_said_in_words() -> None:
     status = read_status(STATUS_4_6)
     assert status == FlightControllerStatus(modes=0, flags=1 << 2 | 1 << 28, total=29)
-    assert status.names == ("RXLOSS", "ARM_SWITCH")
+    assert list(status.reasons) == ["RXLOSS", "ARM_SWITCH"]
     assert status.words.startswith("RXLOSS: it receives no valid channels; ARM_SWITCH: ")
     armed = read_status(STATUS_4_6[:6] + b"\1\0\0\0" + STATUS_4_6[10:16] + b"\2" + STATUS_4_6[17:])
     assert armed.armed and armed.modes == 1 | 1 << 33  # of which the further bytes tell
-    assert FlightControllerStatus(0, 1 << 26, 29).names == ("flag 26",)
+    assert FlightControllerStatus(0, 1 << 26, 29).reasons == {"flag 26": "see `status` in its CLI"}
     assert FlightControllerStatus(0, 0, 29).words == ""
     for size in range(len(STATUS_4_6) - 4):
         assert read_status(STATUS_4_6[:size]) is None

@@ -16,8 +16,7 @@ from dreamer_racing.hil.flyer import ActorFlyer
 from dreamer_racing.hil.links import LinkConfig, make_link
 from dreamer_racing.hil.links.link import ChannelLink, TransportLink
 from dreamer_racing.hil.links.msp import MspTelemetry, encode_msp
-from dreamer_racing.hil.links.sitl import SitlTransport, encode_sitl
-from dreamer_racing.hil.links.tcp import SerialOverTcp
+from dreamer_racing.hil.links.sitl import SerialOverTcp, SitlTransport, encode_sitl
 from dreamer_racing.hil.safety_limits import SafetyLimits
 from dreamer_racing.hil.sticks import ThrustMap
 from dreamer_racing.hil.vehicle import GRAVITY, Command, Setpoint, at_rest
@@ -246,7 +245,6 @@ def test_a_lap_beside_a_receiver_until_the_pilot_takes_back(set_up: SetUp) -> No
     step.after_step = take_part
     step.enable_after = step.elapsed + 2.0
     ended = step.fly(chain_of(step, PilotFlyer(vehicle.track, "faithful"), laps=3), 50.0, 40.0)
-    print(step.elapsed, vehicle.crash_description, vehicle.gates_passed, vehicle.lap_times, step.refusal)
     assert ended == "cut: the flight controller refuses: the pilot flies it: MSP OVERRIDE is off"
     assert vehicle.gates_passed == 5 and len(vehicle.lap_times) == 1
     link.close()

@@ -14,11 +14,8 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
-STATUS, BOXIDS = 101, 119
-"""Codes of the messages."""
-
-ARM, ANGLE, HORIZON, MSP_OVERRIDE = 0, 1, 2, 50
-"""Numbers of modes."""
+STATUS, BOXIDS = 101, 119  # codes of the messages
+ARM, ANGLE, HORIZON, MSP_OVERRIDE = 0, 1, 2, 50  # numbers of modes
 
 _REASONS = (
     ("NOGYRO", "it finds no gyro"),
@@ -65,22 +62,16 @@ class FlightControllerStatus(NamedTuple):
         return bool(self.modes & 1)
 
     @property
-    def names(self) -> tuple[str, ...]:
-        """What prevents arming, by the names of its CLI."""
-        return tuple(name for name, _ in self._reasons())
+    def reasons(self) -> dict[str, str]:
+        """What prevents arming, for a person, by the names of its CLI."""
+        known = dict(enumerate(_REASONS)) | {self.total - 1: _SWITCH}
+        bits = (bit for bit in range(32) if self.flags >> bit & 1)
+        return dict(known.get(bit, (f"flag {bit}", "see `status` in its CLI")) for bit in bits)
 
     @property
     def words(self) -> str:
-        """What prevents arming, for a person; empty if nothing does."""
-        return "; ".join(f"{name}: {reason}" for name, reason in self._reasons())
-
-    def _reasons(self) -> list[tuple[str, str]]:
-        return [self._reason(bit) for bit in range(32) if self.flags >> bit & 1]
-
-    def _reason(self, bit: int) -> tuple[str, str]:
-        if bit == self.total - 1:
-            return _SWITCH
-        return _REASONS[bit] if bit < len(_REASONS) else (f"flag {bit}", "see `status` in its CLI")
+        """What prevents arming, in a sentence; empty if nothing does."""
+        return "; ".join(f"{name}: {reason}" for name, reason in self.reasons.items())
 
 
 def read_status(payload: bytes) -> FlightControllerStatus | None:
@@ -97,8 +88,5 @@ def read_status(payload: bytes) -> FlightControllerStatus | None:
 NOT_READY = frozenset({"NOGYRO", "ANGLE", "BOOTGRACE", "CALIB", "CLI"})
 """Flags that prevent arming while a firmware boots; the others depend on its pilot."""
 
-REQUEST = b"$M<" + bytes([0, STATUS, STATUS])
-"""Request of the status: 6 bytes of MSP version 1."""
-
-BOXIDS_REQUEST = b"$M<" + bytes([0, BOXIDS, BOXIDS])
-"""Request of the list of modes, in the order of the status bits."""
+REQUEST = b"$M<" + bytes([0, STATUS, STATUS])  # request of the status: 6 bytes of MSP version 1
+BOXIDS_REQUEST = b"$M<" + bytes([0, BOXIDS, BOXIDS])  # request of the list of modes, in the order of the status bits

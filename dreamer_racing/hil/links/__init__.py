@@ -1,21 +1,11 @@
-"""Links to vehicles, by name.
-
-| name | transport | sends | needs | battery from | IMU from |
-|---|---|---|---|---|---|
-| ``udp``, ``simulated`` | UDP | setpoints in SI units | port | | `hil.imu` |
-| ``betaflight_sitl`` | UDP, and TCP for MSP | channels | rates, thrust | | RAW_IMU, requested by MSP |
-| ``crsf`` | serial port | channels | device, rates, thrust | BATTERY_SENSOR | |
-| ``sbus`` | serial port | channels | device, rates, thrust | | |
-| ``msp`` | serial or TCP | channels | device or port, rates, thrust | BATTERY_STATE, requested | RAW_IMU |
-| ``msp_override`` | likewise | the four sticks | likewise | likewise | likewise |
-| ``mavlink`` | UDP or serial | rates, motor command | port or device, thrust | BATTERY_STATUS, SYS_STATUS | `mavlink` |
-"""
+"""Links to vehicles, by name; docs/hil_wiring.md has a table of them."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
+from typing import Any
 
 from dreamer_racing.hil.links.crsf import CrsfTelemetry, encode_crsf
 from dreamer_racing.hil.links.link import ChannelLink, Transport, TransportLink
@@ -31,39 +21,55 @@ from dreamer_racing.hil.links.msp import (
     encode_sticks,
 )
 from dreamer_racing.hil.links.sbus import encode_sbus
-from dreamer_racing.hil.links.serial_port import PROTOCOLS, SerialPort, SerialSettings
-from dreamer_racing.hil.links.sitl import MSP_PORT, RC_PORT, SitlTransport, encode_sitl
-from dreamer_racing.hil.links.tcp import SerialOverTcp
-from dreamer_racing.hil.links.telemetry import Telemetry
+from dreamer_racing.hil.links.serial_port import PROTOCOLS, SerialPort, serial_settings
+from dreamer_racing.hil.links.sitl import MSP_PORT, RC_PORT, SerialOverTcp, SitlTransport, encode_sitl
 from dreamer_racing.hil.links.udp import UdpLink, UdpTransport
 from dreamer_racing.hil.sticks import CHANNELS, FIRST_SWITCH, RateMap, ThrustMap
-from dreamer_racing.settings import check_choice, given
+from dreamer_racing.settings import Range, check_choice, check_settings, given, setting
 
 
 @dataclass(frozen=True)
 class LinkConfig:
-    """The choice of a link, and its settings."""
+    """The choice of a link, and its settings.
 
-    name: str  # one of `LINKS`
-    host: str = "127.0.0.1"  # host to send to over UDP or TCP
-    # UDP port, for `betaflight_sitl` 9004 unless given; for `msp` and `msp_override` without a device the TCP port of a
-    # firmware on this machine
-    port: int | None = None
-    device: str | None = None  # a serial port
-    baud: int | None = None  # bits a second of the serial port; by default the protocol's
+    Attributes:
+        name: One of `LINKS`.
+        host: To send to over UDP or TCP.
+        port: UDP port, for ``betaflight_sitl`` 9004 unless given; for ``msp`` and ``msp_override`` without a device the
+            TCP port of a firmware on this machine.
+        device: A serial port.
+        baud: Bits a second of the serial port; None: the protocol's default.
+        rates: Body rates at full stick, of links that send channels.
+        thrust: From thrust to throttle, of links that send that.
+        arm_channel: Index of the channel that arms, 4 for AUX1.
+        rate: Commands a second, to refuse a serial port that is too slow for them; None: not checked.
+        imu: Whether to receive IMU samples.
+        serial_port: For ``betaflight_sitl``: TCP port of the firmware's MSP.
+    """
+
+    name: str
+    host: str = "127.0.0.1"
+    port: int | None = setting(None, Range(1, 65535))
+    device: str | None = None
+    baud: int | None = None
     rates: RateMap | None = None
     thrust: ThrustMap | None = None
-    arm_channel: int = FIRST_SWITCH  # index of the channel that arms, 4 for AUX1
-    rate: float | None = None  # commands a second, to refuse a serial port that is too slow for them; None: not checked
-    imu: bool = False  # whether to receive IMU samples
-    serial_port: int = MSP_PORT  # for `betaflight_sitl`: TCP port of the firmware's MSP
+    arm_channel: int = FIRST_SWITCH
+    rate: float | None = None
+    imu: bool = False
+    serial_port: int = MSP_PORT
 
     def __post_init__(self) -> None:
+        check_settings(self)
         if self.arm_channel not in range(FIRST_SWITCH, CHANNELS):
             raise ValueError(
                 f"arm_channel={self.arm_channel}: must be {FIRST_SWITCH} (AUX1) to {CHANNELS - 1} (AUX12); lower ones "
                 "are the sticks."
             )
+
+    def need(self, field: str) -> Any:
+        """Return a setting that the link cannot do without."""
+        return given(getattr(self, field), field, f"the link {self.name}")
 
 
 def make_link(config: LinkConfig) -> TransportLink:
@@ -102,8 +108,7 @@ def _check_speed(link: TransportLink, config: LinkConfig) -> None:
     """Refuse a serial port so slow that commands would queue up and be dropped."""
     if config.device is None or config.rate is None:
         return
-    settings = _serial_settings(config)
-    size = link.longest
+    settings, size = serial_settings(config.name, config.baud), link.longest
     most = 1.0 / settings.seconds(size)
     if config.rate > most:
         raise ValueError(
@@ -114,33 +119,31 @@ def _check_speed(link: TransportLink, config: LinkConfig) -> None:
 
 
 def _udp(config: LinkConfig) -> TransportLink:
-    return UdpLink(config.host, _port(config), config.imu)
+    return UdpLink(config.host, config.need("port"), config.imu)
 
 
 def _betaflight_sitl(config: LinkConfig) -> TransportLink:
     rates, thrust = _maps(config)
     serial = SerialOverTcp(config.serial_port, config.host)
-    transport = SitlTransport(_datagrams(config, RC_PORT), serial, config.imu)
+    transport = SitlTransport(UdpTransport(config.host, config.port or RC_PORT), serial, config.imu)
     return ChannelLink(transport, encode_sitl, rates, thrust, config.arm_channel, MspTelemetry(G_COUNTS_SITL))
 
 
-def _radio(
-    encode: Callable[[Sequence[float]], bytes], telemetry: Callable[[], Telemetry | None] = lambda: None
-) -> Callable[[LinkConfig], TransportLink]:
-    """Return a factory of links that act as a radio's receiver at a serial port."""
+def _crsf(config: LinkConfig) -> TransportLink:
+    rates, thrust = _maps(config)
+    return ChannelLink(_serial_port(config), encode_crsf, rates, thrust, config.arm_channel, CrsfTelemetry())
 
-    def make(config: LinkConfig) -> TransportLink:
-        rates, thrust = _maps(config)
-        return ChannelLink(_serial_port(config), encode, rates, thrust, config.arm_channel, telemetry())
 
-    return make
+def _sbus(config: LinkConfig) -> TransportLink:
+    rates, thrust = _maps(config)
+    return ChannelLink(_serial_port(config), encode_sbus, rates, thrust, config.arm_channel)
 
 
 def _msp(config: LinkConfig, override: bool = False) -> TransportLink:
     """Make the link to a flight controller whose only receiver is MSP, or whose receiver's sticks MSP overrides."""
     rates, thrust = _maps(config)
     simulated = config.device is None and config.port is not None
-    wire = SerialOverTcp(_port(config), config.host) if simulated else _serial_port(config)
+    wire = SerialOverTcp(config.need("port"), config.host) if simulated else _serial_port(config)
     telemetry = MspTelemetry(G_COUNTS_SITL if simulated else G_COUNTS, override)
     encode, request = (encode_sticks, OVERRIDE_REQUEST) if override else (encode_msp, MSP_REQUEST)
     always = IMU_REQUEST if config.imu else b""
@@ -148,50 +151,31 @@ def _msp(config: LinkConfig, override: bool = False) -> TransportLink:
 
 
 def _mavlink(config: LinkConfig) -> TransportLink:
-    thrust = given(config.thrust, "thrust", f"the link {config.name}")
-    return MavlinkLink(_serial_port(config) if config.device is not None else _datagrams(config), thrust)
+    thrust = config.need("thrust")
+    if config.device is not None:
+        return MavlinkLink(_serial_port(config), thrust)
+    return MavlinkLink(UdpTransport(config.host, config.need("port")), thrust)
 
 
 LINKS: dict[str, Callable[[LinkConfig], TransportLink]] = {
     "udp": _udp,
     "simulated": _udp,
     "betaflight_sitl": _betaflight_sitl,
-    "crsf": _radio(encode_crsf, CrsfTelemetry),
-    "sbus": _radio(encode_sbus),
+    "crsf": _crsf,
+    "sbus": _sbus,
     "msp": _msp,
     "msp_override": partial(_msp, override=True),
     "mavlink": _mavlink,
 }
 """Factory of each link, by name."""
 
-BATTERY_LINKS = ("crsf", "msp", "msp_override", "mavlink")
-"""Links that receive the battery's voltage."""
-
-IMU_LINKS = ("udp", "simulated", "betaflight_sitl", "msp", "msp_override", "mavlink")
-"""Links that can receive IMU samples."""
+BATTERY_LINKS = ("crsf", "msp", "msp_override", "mavlink")  # links that receive the battery's voltage
+IMU_LINKS = ("udp", "simulated", "betaflight_sitl", "msp", "msp_override", "mavlink")  # that can receive IMU samples
 
 
 def _maps(config: LinkConfig) -> tuple[RateMap, ThrustMap]:
-    return given(config.rates, "rates", f"the link {config.name}"), given(
-        config.thrust, "thrust", f"the link {config.name}"
-    )
-
-
-def _port(config: LinkConfig, default: int | None = None) -> int:
-    port = given(default if config.port is None else config.port, "port", f"the link {config.name}")
-    if not 1 <= port <= 65535:
-        raise ValueError(f"port={port}: must be at least 1 and at most 65535.")
-    return port
-
-
-def _datagrams(config: LinkConfig, default_port: int | None = None) -> Transport:
-    return UdpTransport(config.host, _port(config, default_port))
+    return config.need("rates"), config.need("thrust")
 
 
 def _serial_port(config: LinkConfig) -> Transport:
-    return SerialPort(given(config.device, "device", f"the link {config.name}"), _serial_settings(config))
-
-
-def _serial_settings(config: LinkConfig) -> SerialSettings:
-    settings = PROTOCOLS[config.name]
-    return settings if config.baud is None else settings._replace(baud=config.baud)
+    return SerialPort(config.need("device"), serial_settings(config.name, config.baud))

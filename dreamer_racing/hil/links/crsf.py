@@ -16,8 +16,8 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
+from dreamer_racing.hil.links.link import FrameReader, Telemetry
 from dreamer_racing.hil.links.sbus import pack_channels
-from dreamer_racing.hil.links.telemetry import FrameReader, Telemetry
 
 HEADER = b"\xc8\x18\x16"
 ADDRESSES = (0xC8, 0xEA, 0xEC, 0xEE)

@@ -1,10 +1,8 @@
 """MAVLink 2 to PX4: SET_ATTITUDE_TARGET with body rates and thrust, and the command that arms.
 
-The vehicle must be in offboard mode; a person switches it there, by radio. Not for ArduPilot, which takes thrust for a
-climb rate unless its ``GUID_OPTIONS`` say otherwise, and keeps hovering when commands stop.
-
-Disarming is forced: it stops the motors in the air too, as the arm switch of the other links does. Unlike that switch
-it works in every mode, so it is not sent before this link has armed the vehicle: a flight of another pilot goes on.
+Not for ArduPilot, see docs/hil_wiring.md. Disarming is forced: it stops the motors in the air too, as the arm switch of
+the other links does. Unlike that switch it works in every mode, so it is not sent before this link has armed the
+vehicle: a flight of another pilot goes on.
 
 Thrust is sent as the motors' command (`ThrustMap.to_motor`), which PX4 passes on unchanged with ``THR_MDL_FAC = 0``.
 
@@ -26,22 +24,16 @@ import numpy as np
 
 from dreamer_racing.commands import import_extra
 from dreamer_racing.hil.imu import make_sample
-from dreamer_racing.hil.links.link import Transport, TransportLink
-from dreamer_racing.hil.links.telemetry import Telemetry
+from dreamer_racing.hil.links.link import Telemetry, Transport, TransportLink
 from dreamer_racing.hil.sticks import ThrustMap
 from dreamer_racing.hil.vehicle import GRAVITY, Command, Setpoint
 
-SYSTEM, AUTOPILOT = 1, 1
-"""IDs of the vehicle and of its autopilot."""
-IGNORE_ATTITUDE = 128
-"""ATTITUDE_TARGET_TYPEMASK: rates and thrust count, the attitude does not."""
-FORCE = 21196.0
-"""Second parameter of COMPONENT_ARM_DISARM: disarm even in flight."""
-STANDARD_GRAVITY = 9.80665
-"""m/s² per G in SCALED_IMU."""
+SYSTEM, AUTOPILOT = 1, 1  # IDs of the vehicle and of its autopilot
+IGNORE_ATTITUDE = 128  # ATTITUDE_TARGET_TYPEMASK: rates and thrust count, the attitude does not
+FORCE = 21196.0  # second parameter of COMPONENT_ARM_DISARM: disarm even in flight
+STANDARD_GRAVITY = 9.80665  # m/s² per G in SCALED_IMU
 FIRST_BATTERY = 0
-UNKNOWN = 65535
-"""mV, value of an unknown voltage."""
+UNKNOWN = 65535  # mV, value of an unknown voltage
 _LONGEST = Setpoint(GRAVITY, np.ones(3))  # without zeros, which the wire omits at a message's end
 ARM_TRIES = 5
 """Arm messages sent from the first armed command on: one may be lost, but a vehicle that has disarmed itself later must
@@ -128,7 +120,7 @@ class MavlinkTelemetry(Telemetry):
 
     def read(self, data: bytes) -> list[float]:
         """Parse bytes; return the voltages in them, V, oldest first."""
-        voltages = []
+        voltages: list[float] = []
         for message in self._parser.parse_buffer(data) or []:
             kind = message.get_type()
             if kind == "BAD_DATA":
@@ -136,13 +128,9 @@ class MavlinkTelemetry(Telemetry):
             elif message.get_srcSystem() != SYSTEM:
                 continue
             elif kind in SAMPLES:
-                sample = SAMPLES[kind](message)
-                self.rejected += sample is None
-                self.imu_samples += [] if sample is None else [sample]
+                self._add(self.imu_samples, SAMPLES[kind](message))
             elif kind in VOLTAGES and not (kind == "BATTERY_STATUS" and message.id != FIRST_BATTERY):
-                voltage = VOLTAGES[kind](message)
-                self.rejected += voltage is None
-                voltages += [] if voltage is None else [voltage]
+                self._add(voltages, VOLTAGES[kind](message))
         return voltages
 
 
@@ -151,13 +139,9 @@ def _of_battery_status(message: Any) -> float | None:
     return sum(cells) / 1000 if cells else None
 
 
-def _of_sys_status(message: Any) -> float | None:
-    return None if message.voltage_battery == UNKNOWN else message.voltage_battery / 1000
-
-
 VOLTAGES: dict[str, Callable[[Any], float | None]] = {
     "BATTERY_STATUS": _of_battery_status,
-    "SYS_STATUS": _of_sys_status,
+    "SYS_STATUS": lambda message: None if message.voltage_battery == UNKNOWN else message.voltage_battery / 1000,
 }
 """Reader of the voltage, V, by message name; it returns None if the voltage is unknown."""
 

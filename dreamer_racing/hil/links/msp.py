@@ -40,20 +40,15 @@ from dreamer_racing.hil.betaflight.status import (
     read_status,
 )
 from dreamer_racing.hil.imu import make_sample
-from dreamer_racing.hil.links.telemetry import FrameReader, Telemetry
+from dreamer_racing.hil.links.link import FrameReader, Telemetry
 
 SET_RAW_RC, BATTERY_STATE, RAW_IMU = 200, 130, 102
-BATTERY_REQUEST = b"$M<" + bytes([0, BATTERY_STATE, BATTERY_STATE])
-"""Request of the battery's state: 6 bytes."""
-MSP_REQUEST = BATTERY_REQUEST + REQUEST
-"""Request of battery and status, sent every `ASK_EVERY` commands."""
-OVERRIDE_REQUEST = MSP_REQUEST + BOXIDS_REQUEST
-"""The same, and a request of the list of modes."""
+BATTERY_REQUEST = b"$M<" + bytes([0, BATTERY_STATE, BATTERY_STATE])  # request of the battery's state: 6 bytes
+MSP_REQUEST = BATTERY_REQUEST + REQUEST  # request of battery and status, sent every `ASK_EVERY` commands
+OVERRIDE_REQUEST = MSP_REQUEST + BOXIDS_REQUEST  # the same, and a request of the list of modes
 _BATTERY_PAYLOAD = 11
-IMU_REQUEST = b"$M<" + bytes([0, RAW_IMU, RAW_IMU])
-"""Request of an IMU sample: 6 bytes."""
-GYRO_COUNTS = 16.4
-"""Counts of the gyro per deg/s."""
+IMU_REQUEST = b"$M<" + bytes([0, RAW_IMU, RAW_IMU])  # request of an IMU sample: 6 bytes
+GYRO_COUNTS = 16.4  # counts of the gyro per deg/s
 G_COUNTS, G_COUNTS_SITL = 512.0, 256.0
 """Counts of acceleration per 9.81 m/s²: of sensors, and of a firmware that was built for a computer."""
 _IMU = struct.Struct("<6h")
@@ -94,20 +89,16 @@ class MspTelemetry(Telemetry):
 
     def read(self, data: bytes) -> list[float]:
         """Parse bytes; return the voltages in them, V, in steps of 0.01 V."""
-        voltages = []
+        voltages: list[float] = []
         for frame in self._frames.read(data):
             if frame is None:
                 self.rejected += 1
                 continue
             kind, payload, answered = frame[4], frame[5:-1], frame[2] == ord(">")
             if kind == BATTERY_STATE:
-                voltage = _voltage(payload) if answered else None
-                voltages += [] if voltage is None else [voltage]
-                self.rejected += voltage is None
+                self._add(voltages, _voltage(payload) if answered else None)
             elif kind == RAW_IMU:
-                sample = self._sample(payload) if answered else None
-                self.imu_samples += [] if sample is None else [sample]
-                self.rejected += sample is None
+                self._add(self.imu_samples, self._sample(payload) if answered else None)
             elif kind == STATUS and answered:
                 self.status = read_status(payload) or self.status
             elif kind == BOXIDS and answered:

@@ -32,6 +32,13 @@ PROTOCOLS = {
 }
 """Settings by name of the protocol."""
 
+
+def serial_settings(protocol: str, baud: int | None) -> SerialSettings:
+    """Return the settings of a protocol, at another baud rate if one is given."""
+    settings = PROTOCOLS[protocol]
+    return settings if baud is None else settings._replace(baud=baud)
+
+
 BACKLOG = 2
 """Commands that may wait in a port's buffer when the next one is written [choice]: one being sent, and one more."""
 
@@ -119,8 +126,6 @@ class SerialPort:
 def open_port(device: str, settings: SerialSettings) -> Any:
     """Return an open port of pyserial; raises as `SerialPort` does."""
     serial = import_extra("serial", "hil", "A serial link needs pyserial")
-    if settings.baud <= 0:
-        raise ValueError(f"baud={settings.baud}: must be above 0.")
     try:
         return serial.Serial(
             device,

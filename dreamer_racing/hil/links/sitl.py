@@ -12,6 +12,7 @@ Reference: Betaflight, src/platform/SIMULATOR/sitl.c (rc_packet).
 from __future__ import annotations
 
 import logging
+import socket
 import struct
 import time
 from collections.abc import Iterator, Sequence
@@ -19,7 +20,6 @@ from collections.abc import Iterator, Sequence
 from dreamer_racing.hil.betaflight.status import NOT_READY, REQUEST
 from dreamer_racing.hil.links.link import ASK_EVERY, Transport
 from dreamer_racing.hil.links.msp import IMU_REQUEST, MspTelemetry
-from dreamer_racing.hil.links.tcp import SerialOverTcp
 
 logger = logging.getLogger(__name__)
 
@@ -31,6 +31,68 @@ _STAMP = 0.0
 def encode_sitl(channels: Sequence[float]) -> bytes:
     """Return the packet of 16 channels in µs, rounded to 1 µs."""
     return _PACKET.pack(_STAMP, *(round(value) for value in channels))
+
+
+class SerialOverTcp:
+    """A `Transport` that never blocks, and connects again whenever the firmware closes the connection.
+
+    The firmware takes one connection at a time, and closes another at once.
+    """
+
+    _RETRY_AFTER = 0.5  # s between attempts to connect
+
+    def __init__(self, port: int, host: str = "127.0.0.1") -> None:
+        self._address = (host, port)
+        self._socket: socket.socket | None = None
+        self._next = 0.0  # when to connect next, s of `time.monotonic`
+
+    def write(self, data: bytes) -> bool:
+        """Write bytes; return whether they were sent."""
+        if self._socket is None:
+            self._connect()
+        try:
+            return self._socket is not None and self._socket.send(data) == len(data)
+        except BlockingIOError:
+            return False
+        except OSError:
+            self._disconnect()
+            return False
+
+    def discard(self) -> None:
+        """Do nothing: bytes leave at once."""
+
+    def read(self) -> Iterator[tuple[float, bytes]]:
+        """Yield the received bytes, if any, with the time now, s (``time.monotonic``)."""
+        if self._socket is None:
+            return
+        try:
+            data = self._socket.recv(4096)
+        except BlockingIOError:
+            return
+        except OSError:
+            data = b""
+        if data:
+            yield time.monotonic(), data
+        else:
+            self._disconnect()
+
+    def close(self) -> None:
+        """Close the connection; may be called twice."""
+        if self._socket is not None:
+            self._socket.close()
+        self._socket = None
+
+    def _connect(self) -> None:
+        if time.monotonic() >= self._next:
+            self._next = time.monotonic() + self._RETRY_AFTER
+            self._socket = socket.socket(socket.AF_INET, socket.SOCK_STREAM)
+            self._socket.setblocking(False)
+            self._socket.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+            self._socket.connect_ex(self._address)  # if nobody listens, the first write fails
+
+    def _disconnect(self) -> None:
+        self.close()
+        self._next = time.monotonic() + self._RETRY_AFTER
 
 
 class SitlTransport:
@@ -64,7 +126,7 @@ class SitlTransport:
         if self._boots is None or self._asked_at is None:
             return
         status = self._boots.status
-        if status is not None and not NOT_READY.intersection(status.names):
+        if status is not None and not NOT_READY & status.reasons.keys():
             logger.info("the firmware has booted: channels are sent to it from now on")
             self._boots = None
         elif status is None and time.monotonic() - self._asked_at > self.ANSWERS_WITHIN:

@@ -17,8 +17,7 @@ from typing import NamedTuple
 import numpy as np
 
 from dreamer_racing.hil.imu import decode_imu
-from dreamer_racing.hil.links.link import TransportLink
-from dreamer_racing.hil.links.telemetry import Telemetry
+from dreamer_racing.hil.links.link import Telemetry, TransportLink
 from dreamer_racing.hil.packets import PacketFormat
 from dreamer_racing.hil.vehicle import Command, Setpoint
 
@@ -81,20 +80,16 @@ class UdpTransport:
         """Send a datagram; return whether that worked: not if buffers are full or the last one reached no listener."""
         heard, self._heard = self._heard, True
         try:
-            return self._send(data) and heard
+            try:
+                self._socket.send(data)
+            except ConnectionRefusedError:  # is of the last datagram; this one was not sent
+                heard = False
+                self._socket.send(data)
         except OSError as error:
             if error.errno not in _TRANSIENT_ERRORS:
                 raise
             return False
-
-    def _send(self, data: bytes) -> bool:
-        """Send a datagram even if the last one was refused; return whether the last one reached a listener."""
-        try:
-            self._socket.send(data)
-        except ConnectionRefusedError:  # is of the last datagram; this one was not sent
-            self._socket.send(data)
-            return False
-        return True
+        return heard
 
     def discard(self) -> None:
         """Do nothing: datagrams leave at once, or not at all."""
@@ -126,9 +121,7 @@ class PacketTelemetry(Telemetry):
 
     def read(self, data: bytes) -> list[float]:
         """Parse a datagram, which has no voltages."""
-        sample = decode_imu(data)
-        self.rejected += sample is None
-        self.imu_samples += [] if sample is None else [sample]
+        self._add(self.imu_samples, decode_imu(data))
         return []
 
 

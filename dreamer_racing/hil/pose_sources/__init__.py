@@ -1,10 +1,4 @@
-"""Sources of poses, by name.
-
-| name | transport | message | needs |
-|---|---|---|---|
-| ``udp`` | UDP | the packet of `hil.pose` | port |
-| ``mavlink`` | UDP, or serial port | ODOMETRY unless another is named | port or device |
-| ``ros2`` | ROS 2 | PoseStamped unless Odometry is named | topic, and an installed ROS 2 |
+"""Sources of poses, by name; docs/hil_wiring.md has a table of them.
 
 All give poses in the frames of `Pose`, stamped by the sender's clock. Velocities that a message lacks are estimated
 from successive poses.
@@ -12,39 +6,41 @@ from successive poses.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
-from dataclasses import dataclass
-
-from dreamer_racing.hil.inlet import Inlet, UdpInlet
-from dreamer_racing.hil.links.serial_port import PROTOCOLS, SerialPort
+from dreamer_racing.hil.inlet import UdpInlet
+from dreamer_racing.hil.links.serial_port import SerialPort, serial_settings
 from dreamer_racing.hil.pose import PoseSource, UdpPose
 from dreamer_racing.hil.pose_sources import mavlink, ros2
-from dreamer_racing.hil.pose_sources.mavlink import MavlinkPose
 from dreamer_racing.hil.pose_sources.messages import SMOOTHING
-from dreamer_racing.hil.pose_sources.ros2 import Ros2Pose
-from dreamer_racing.settings import Range, check_choice, check_settings, given, setting
+from dreamer_racing.settings import check_choice, given
+
+POSE_SOURCES = {"udp": (), "mavlink": tuple(mavlink.MESSAGES), "ros2": tuple(ros2.MESSAGES)}
+"""Types of messages that each source reads; the first one is its default."""
+
+WITHOUT_VELOCITIES = ("VISION_POSITION_ESTIMATE", "ATT_POS_MOCAP", "PoseStamped")
+"""Messages without velocities, to which ``smoothing`` applies."""
 
 
-@dataclass(frozen=True)
-class PoseConfig:
-    """The choice of a pose source, and its settings."""
-
-    name: str  # one of `POSE_SOURCES`
-    host: str = "127.0.0.1"  # address to listen on over UDP; the default accepts poses from this machine only
-    port: int | None = setting(None, Range(0, 65535))  # UDP port to listen on; 0 for a free one
-    device: str | None = None  # path of a serial port; if given, `mavlink` listens to it and not to the UDP port
-    baud: int | None = setting(None, Range(1))  # bits a second of the serial port; by default the protocol's
-    topic: str | None = None  # topic of ROS 2
-    message: str | None = None  # message type of the pose; by default the source's first one
-    # s, time constant of velocities estimated from poses; 0: they are not smoothed
-    smoothing: float = setting(SMOOTHING, Range(0, 1))
-
-    def __post_init__(self) -> None:
-        check_settings(self)
-
-
-def make_poses(config: PoseConfig) -> PoseSource:
+def make_poses(
+    name: str,
+    host: str = "127.0.0.1",
+    port: int | None = None,
+    device: str | None = None,
+    baud: int | None = None,
+    topic: str | None = None,
+    message: str | None = None,
+    smoothing: float = SMOOTHING,
+) -> PoseSource:
     """Make a pose source and open its port, device or topic.
+
+    Args:
+        name: One of `POSE_SOURCES`.
+        host: Address to listen on over UDP; the default accepts poses from this machine only.
+        port: UDP port to listen on; 0 for a free one.
+        device: Path of a serial port; if given, ``mavlink`` listens to it and not to the UDP port.
+        baud: Bits a second of the serial port; None: the protocol's default.
+        topic: Topic of ROS 2.
+        message: Message type of the pose; None: the source's first one.
+        smoothing: s, time constant of velocities estimated from poses; 0: they are not smoothed.
 
     Raises:
         ValueError: There is no source of that name, or a setting that it needs is missing or impossible.
@@ -52,47 +48,17 @@ def make_poses(config: PoseConfig) -> PoseSource:
         ImportError: A package is missing; the message says how to get it.
 
     Example:
-        >>> make_poses(PoseConfig("udp", port=0)).close()
+        >>> make_poses("udp", port=0).close()
     """
-    check_choice("name", config.name, POSE_SOURCES)
-    return POSE_SOURCES[config.name](config)
-
-
-def _udp(config: PoseConfig) -> PoseSource:
-    return UdpPose(given(config.port, "port", f"the pose source {config.name}"), config.host)
-
-
-def _mavlink(config: PoseConfig) -> PoseSource:
-    message = _message(config, mavlink.MESSAGES)
-    return MavlinkPose(_inlet(config), message, config.smoothing)
-
-
-def _ros2(config: PoseConfig) -> PoseSource:
-    return Ros2Pose(
-        given(config.topic, "topic", f"the pose source {config.name}"),
-        _message(config, ros2.MESSAGES),
-        config.smoothing,
-    )
-
-
-WITHOUT_VELOCITIES = ("VISION_POSITION_ESTIMATE", "ATT_POS_MOCAP", "PoseStamped")
-"""Messages without velocities, to which `PoseConfig.smoothing` applies."""
-
-POSE_SOURCES: dict[str, Callable[[PoseConfig], PoseSource]] = {"udp": _udp, "mavlink": _mavlink, "ros2": _ros2}
-"""Factory of each pose source, by name."""
-
-
-def _message(config: PoseConfig, messages: Iterable[str]) -> str:
-    """Return the configured message type; refuse one that the source does not know."""
-    known = list(messages)
-    message = known[0] if config.message is None else config.message
+    check_choice("name", name, POSE_SOURCES)
+    user, known = f"the pose source {name}", POSE_SOURCES[name]
+    if name == "udp":
+        return UdpPose(given(port, "port", user), host)
+    message = message or known[0]
     if message not in known:
-        raise ValueError(f"message={message}: for the pose source {config.name}, must be one of {', '.join(known)}.")
-    return message
-
-
-def _inlet(config: PoseConfig) -> Inlet:
-    if config.device is None:
-        return UdpInlet(given(config.port, "port or device", f"the pose source {config.name}"), config.host)
-    settings = PROTOCOLS["mavlink"]
-    return SerialPort(config.device, settings if config.baud is None else settings._replace(baud=config.baud))
+        raise ValueError(f"message={message}: for {user}, must be one of {', '.join(known)}.")
+    if name == "ros2":
+        return ros2.Ros2Pose(given(topic, "topic", user), message, smoothing)
+    if device is not None:
+        return mavlink.MavlinkPose(SerialPort(device, serial_settings("mavlink", baud)), message, smoothing)
+    return mavlink.MavlinkPose(UdpInlet(given(port, "port or device", user), host), message, smoothing)

@@ -33,8 +33,7 @@ from dreamer_racing.hil.links.mavlink import import_messages
 from dreamer_racing.hil.pose import PosePacket, make_packet, plausible
 from dreamer_racing.hil.pose_sources.messages import SMOOTHING, Measurement, MessagePose
 
-LOCAL_NED, BODY_FRD, LOCAL_FRD = 1, 12, 20
-"""Values of MAV_FRAME."""
+LOCAL_NED, BODY_FRD, LOCAL_FRD = 1, 12, 20  # values of MAV_FRAME
 
 PAIR_WITHIN = 0.05
 """s between a position and an attitude up to which they form a pose [choice]: autopilots send both at 20 Hz or more."""

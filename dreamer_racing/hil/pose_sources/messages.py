@@ -19,14 +19,12 @@ from dreamer_racing.hil.stamping import SILENCE
 SMOOTHING = 0.01
 """s, time constant of velocities estimated from poses [choice]: two poses of a motion capture at 200 Hz."""
 
-GAP = 0.1
-"""s between two poses beyond which their difference says nothing about the present velocity [choice]."""
+GAP = 0.1  # s between two poses beyond which their difference says nothing about the present velocity [choice]
 
 SPEED_MAX = 50.0
 """m/s above which a pose has jumped instead of moved [choice]: more than twice what racing drones reach."""
 
-RATE_MAX = 50.0
-"""rad/s above which an attitude has jumped instead of turned [choice]: almost three times 1000 deg/s."""
+RATE_MAX = 50.0  # rad/s above which an attitude has jumped instead of turned [choice]: almost three times 1000 deg/s
 
 
 class Measurement(NamedTuple):
@@ -151,11 +149,11 @@ class VelocityEstimator:
         if np.linalg.norm(moved) > SPEED_MAX * elapsed or np.linalg.norm(turned) > RATE_MAX * elapsed:
             self._velocity = None
             return None
-        self._velocity = self._filtered(Velocity(moved / elapsed, turned / elapsed), elapsed)
-        return self._velocity
-
-    def _filtered(self, measured: Velocity, elapsed: float) -> Velocity:
+        measured = Velocity(moved / elapsed, turned / elapsed)
         if self._velocity is None or self._time_constant == 0.0:
-            return measured
-        gain = -math.expm1(-elapsed / self._time_constant)  # exact for a constant input
-        return Velocity(*(old + gain * (new - old) for old, new in zip(self._velocity, measured, strict=True)))
+            self._velocity = measured
+        else:
+            gain = -math.expm1(-elapsed / self._time_constant)  # exact for a constant input
+            pairs = zip(self._velocity, measured, strict=True)
+            self._velocity = Velocity(*(old + gain * (new - old) for old, new in pairs))
+        return self._velocity

@@ -201,10 +201,9 @@ def test_no_serial_port():
         SerialPort("/dev/null", MSP)
 
 
-@pytest.mark.parametrize("baud", [0, 2**40])
-def test_no_such_rate(wire, baud):
-    with pytest.raises(ValueError, match=f"baud={baud}: "):
-        SerialPort(wire[1], SerialSettings(baud, "N", 1))
+def test_no_such_rate(wire):
+    with pytest.raises(ValueError, match=f"baud={2**40}: "):
+        SerialPort(wire[1], SerialSettings(2**40, "N", 1))
 
 
 def test_without_pyserial(monkeypatch):

@@ -16,8 +16,7 @@ from dreamer_racing.hil.links import LinkConfig, make_link
 from dreamer_racing.hil.links.link import ASK_EVERY, ChannelLink, TransportLink
 from dreamer_racing.hil.links.mavlink import MavlinkLink
 from dreamer_racing.hil.links.msp import IMU_REQUEST, OVERRIDE_REQUEST, MspTelemetry
-from dreamer_racing.hil.links.sitl import SitlTransport
-from dreamer_racing.hil.links.tcp import SerialOverTcp
+from dreamer_racing.hil.links.sitl import SerialOverTcp, SitlTransport
 from dreamer_racing.hil.vehicle import Command, Setpoint, at_rest, hover
 from tests.hil.links.frames import CHANNEL_LINKS, RATES, RESTING, THRUST, Recorder, msp_answer, read_words
 

@@ -16,7 +16,7 @@ mavlink = pytest.importorskip("pymavlink.dialects.v20.common")
 
 from dreamer_racing.hil.attitude import rotation_matrix  # noqa: E402
 from dreamer_racing.hil.inlet import UdpInlet  # noqa: E402
-from dreamer_racing.hil.pose_sources import PoseConfig, make_poses  # noqa: E402
+from dreamer_racing.hil.pose_sources import make_poses  # noqa: E402
 from dreamer_racing.hil.pose_sources.mavlink import MESSAGES, MavlinkPose  # noqa: E402
 from dreamer_racing.hil.stamping import PoseClock, Stamping  # noqa: E402
 
@@ -384,7 +384,7 @@ class TestSerial:
     def test_messages_come_in_pieces_amid_noise(self, wire):
         pytest.importorskip("serial")
         far, path = wire
-        source = make_poses(PoseConfig("mavlink", device=path, baud=921_600))
+        source = make_poses("mavlink", device=path, baud=921_600)
         assert source.poll() == []
         sent = b"noise" + pack(odometry(1000)) + pack(odometry(2000))
         os.write(far, sent[:60])
@@ -400,7 +400,7 @@ class TestSerial:
         pytest.importorskip("serial")
         far, near = os.openpty()
         tty.setraw(near)
-        source = make_poses(PoseConfig("mavlink", device=os.ttyname(near)))
+        source = make_poses("mavlink", device=os.ttyname(near))
         os.close(near)
         os.close(far)
         with pytest.raises(OSError, match="it is gone"):
