@@ -19,7 +19,7 @@ from tests.training.test_checkpoint import Payload
 ROOT = Path(__file__).parents[1]
 RUNS_TEXT = {"eval", "exec", "compile", "__import__"}
 UNPICKLES = {"pickle", "cPickle", "dill", "cloudpickle", "joblib", "shelve", "marshal"}
-OWN_MEMORY = {"dreamer_racing/hil/view.py": ["marshal"]}  # between a flight and its own child, in memory they share
+OWN_MEMORY = {"dreamer_racing/hil/view.py": ["marshal"]}  # from a flight to its own child, by a pipe
 SOURCES = [*(ROOT / "dreamer_racing").rglob("*.py"), *(ROOT / "recipes").rglob("*.py")]
 
 

@@ -1,7 +1,8 @@
 """A web page that shows a flight live: the actor's image, state, target gate and speed.
 
-`LiveView.show` is one of `FlightLoop`'s ``watchers``. Without waiting, it copies a frame into shared memory. A separate
-process at the lowest priority reads it and serves the page; it is this file run as a script:
+`LiveView.show` is one of `FlightLoop`'s ``watchers``. Without waiting, it hands a frame to a thread, or drops it if the
+last ones are still on their way. The thread sends it by a pipe to a separate process at the lowest priority, which
+serves the page; it is this file run as a script:
 
 | path | what |
 |---|---|
@@ -9,10 +10,6 @@ process at the lowest priority reads it and serves the page; it is this file run
 | ``/stream`` | the images as they come, enlarged (MJPEG) |
 | ``/image.jpg`` | the newest one |
 | ``/state`` | the newest numbers (JSON) |
-
-A frame in memory, little endian: count u32 (odd while it is being written), size of numbers u32, their CRC-32 u32, size
-of image u32, numbers (marshal: both ends run the same Python), image (uint8 RGB). A reader that finds the count changed
-reads the frame again.
 """
 
 from __future__ import annotations
@@ -20,40 +17,27 @@ from __future__ import annotations
 import html
 import io
 import json
-import logging
 import marshal
 import math
-import mmap
 import os
 import socket
-import struct
 import subprocess
 import sys
-import tempfile
 import threading
 import time
-import zlib
+from contextlib import suppress
+from functools import partial
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
-from typing import TYPE_CHECKING, Any, NamedTuple
-
-import numpy as np
+from typing import IO, TYPE_CHECKING, Any, NamedTuple
 
 if TYPE_CHECKING:  # not needed by the serving process
     from dreamer_racing.hil.chain import Outputs
 
-logger = logging.getLogger(__name__)
-
 PORT = 9103
-ROOM = 1 << 22
-"""Largest size of a frame, bytes [choice]: images of up to 1000 × 1000 pixels."""
-SHOWN_WIDTH = 512
-"""Width in pixels to which images are enlarged, by a whole factor [choice]."""
-STREAM_RATE = 30.0
-"""Largest rate of images, Hz [choice]."""
-SILENCE = 1.0
-"""s without a tick after which the page says so [choice]."""
+SHOWN_WIDTH = 512  # width in pixels to which images are enlarged, by a whole factor [choice]
+STREAM_RATE = 30.0  # largest rate of images, Hz [choice]
+SILENCE = 1.0  # s without a tick after which the page says so [choice]
 
-_COUNT, _HEAD = struct.Struct("<I"), struct.Struct("<IIII")
 _BOUNDARY = "frame"
 _START_WITHIN = 20.0  # s
 
@@ -63,11 +47,9 @@ class LiveView:
 
     Args:
         port: Port of the page; 0 picks a free one.
-        host: Address to listen on; by default only this machine sees the page.
 
     Attributes:
         address: URL of the page.
-        too_large: Number of images so far that were too large for a frame, and were left out.
 
     Raises:
         OSError: The port is in use, or the page cannot be served; the message says which.
@@ -79,38 +61,23 @@ class LiveView:
         >>> view.close()
     """
 
-    def __init__(self, port: int = PORT, host: str = "127.0.0.1") -> None:
-        self.too_large = 0
+    def __init__(self, port: int = PORT) -> None:
+        from dreamer_racing.hil.background_worker import BackgroundWorker  # not needed by the serving process
+
         self._shown = 0
-        listening = _listen(host, port)
-        descriptor = _memory_file()
-        try:
-            self.address = f"http://{host}:{listening.getsockname()[1]}/"
-            self._memory = mmap.mmap(descriptor, ROOM)
-            self._memory[:] = bytes(ROOM)  # touched now, to avoid page faults in flight
-            self._server = _start_server(descriptor, listening)
-        finally:
-            listening.close()
-            os.close(descriptor)
-        if not host.startswith("127."):
-            logger.warning("view: listens on %s: everyone who can reach that address can see the flight", host)
+        with _listen(port) as listening:
+            self.address = f"http://127.0.0.1:{listening.getsockname()[1]}/"
+            self._server, self._pipe = _start_server(listening)
+        self._worker = BackgroundWorker(most=1)
 
     def show(self, outputs: Outputs) -> None:
         """Show the outputs of a tick, without blocking."""
-        if self._memory.closed:
-            return
-        image, memory = outputs.image, self._memory
-        pixels = b"" if image is None else np.ascontiguousarray(image).data.cast("B")
-        numbers = marshal.dumps(self._numbers(outputs))  # a tenth of JSON's time
-        middle = _HEAD.size + len(numbers)
-        if middle + len(pixels) > ROOM:
-            self.too_large += 1
-            pixels = b""
-        count = 2 * self._shown % 2**32
-        memory[: _HEAD.size] = _HEAD.pack(count + 1, len(numbers), zlib.crc32(numbers), len(pixels))
-        memory[_HEAD.size : middle] = numbers
-        memory[middle : middle + len(pixels)] = pixels
-        memory[: _COUNT.size] = _COUNT.pack(count)
+        pixels = b"" if outputs.image is None else outputs.image.tobytes()
+        self._worker.submit(partial(self._send, (self._numbers(outputs), pixels)))
+
+    def _send(self, frame: tuple[dict[str, Any], bytes]) -> None:
+        marshal.dump(frame, self._pipe)  # a tenth of JSON's time
+        self._pipe.flush()
 
     def _numbers(self, outputs: Outputs) -> dict[str, Any]:
         verdict, pose, image = outputs.verdict, outputs.pose, outputs.image
@@ -133,91 +100,60 @@ class LiveView:
 
     def close(self) -> None:
         """Stop serving the page; may be called twice."""
-        if self._memory.closed:
-            return
-        self._memory.close()
-        assert self._server.stdin is not None
-        assert self._server.stdout is not None
-        self._server.stdin.close()  # the server ends with its input
+        if not self._worker.close(patience=1.0):
+            self._server.kill()  # it reads no more
+        with suppress(BrokenPipeError):
+            self._pipe.close()  # the server ends with its input
         try:
             self._server.wait(timeout=2.0)
         except subprocess.TimeoutExpired:
             self._server.kill()
             self._server.wait()
-        self._server.stdout.close()
 
 
-def _listen(host: str, port: int) -> socket.socket:
-    """Return a socket to which browsers can connect."""
+def _listen(port: int) -> socket.socket:
+    """Return a socket to which browsers of this machine, and no other, can connect."""
     listening = socket.socket(socket.AF_INET, socket.SOCK_STREAM)
     listening.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)  # a page closed just before may hold the port
     try:
-        listening.bind((host, port))
+        listening.bind(("127.0.0.1", port))
         listening.listen(16)
     except (OSError, OverflowError) as error:
         listening.close()
-        message = f"the view cannot listen on {host}:{port}: {error}. Is another program, or flight, using it?"
+        message = f"the view cannot listen on 127.0.0.1:{port}: {error}. Is another program, or flight, using it?"
         raise OSError(message) from error
     return listening
 
 
-def _memory_file() -> int:
-    """Return the descriptor of an unnamed file of `ROOM` bytes, in memory if possible."""
-    if hasattr(os, "memfd_create"):
-        descriptor = os.memfd_create("dreamer_racing_view")
-    else:
-        with tempfile.TemporaryFile() as file:
-            descriptor = os.dup(file.fileno())
-    os.truncate(descriptor, ROOM)
-    return descriptor
-
-
-def _start_server(memory: int, listening: socket.socket) -> subprocess.Popen[bytes]:
-    """Start the serving process, and wait until it is ready."""
-    shared = (memory, listening.fileno())
+def _start_server(listening: socket.socket) -> tuple[subprocess.Popen[bytes], IO[bytes]]:
+    """Start the serving process, and wait until it is ready; return it and the pipe to it."""
     # Run by path, so that it imports nothing of the flight; -P, because files beside this one shadow standard modules.
-    command = [sys.executable, "-P", os.path.abspath(__file__), *map(str, shared)]
+    command = [sys.executable, "-P", os.path.abspath(__file__), str(listening.fileno())]
     # In its own session: Ctrl-C in the terminal is for the flight.
     server = subprocess.Popen(
-        command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, pass_fds=shared, start_new_session=True
+        command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, pass_fds=(listening.fileno(),), start_new_session=True
     )
     assert server.stdin is not None
     assert server.stdout is not None
     patience = threading.Timer(_START_WITHIN, server.kill)
     patience.start()
-    ready = server.stdout.readline()
+    with server.stdout as answer:
+        ready = answer.readline()
     patience.cancel()
     if not ready:
         server.stdin.close()
-        server.stdout.close()
         raise OSError(f"the view's process did not start: it ended with status {server.wait()}; see above.")
-    return server
+    return server, server.stdin
 
 
 # --- in the serving process ---
 
 
 class Frame(NamedTuple):
-    """A frame read from memory."""
+    """What the page shows of a tick."""
 
-    numbers: dict[str, Any]  # the values of a tick, from `LiveView`
+    numbers: dict[str, Any]  # the values of the tick, from `LiveView`
     pixels: bytes  # raw bytes of the image; empty without one
-
-
-def read_frame(memory: mmap.mmap, tries: int = 20) -> Frame | None:
-    """Return the newest frame; None if there is none yet, or it was being written at each try."""
-    for _ in range(tries):
-        count, length, check, size = _HEAD.unpack_from(memory)
-        if not length:
-            return None
-        middle = _HEAD.size + length
-        numbers, pixels = memory[_HEAD.size : middle], memory[middle : middle + size]
-        # The CRC is for machines on which other processes may see writes out of order: pixels may then mix two images,
-        # but the parsed numbers are intact.
-        if not count % 2 and _COUNT.unpack_from(memory)[0] == count and zlib.crc32(numbers) == check:
-            return Frame(marshal.loads(numbers), pixels)
-        time.sleep(0.0005)
-    return None
 
 
 def enlarged(frame: Frame) -> bytes:
@@ -283,7 +219,7 @@ look();
 class _Page(BaseHTTPRequestHandler):
     """Handles requests of browsers."""
 
-    memory: mmap.mmap
+    frame: Frame | None = None  # the newest one
     timeout = 5.0  # s that a browser may take
 
     def do_GET(self) -> None:
@@ -298,20 +234,19 @@ class _Page(BaseHTTPRequestHandler):
         """Log nothing: the terminal belongs to the flight."""
 
     def _page(self) -> None:
-        text = _PAGE.format(width=SHOWN_WIDTH, text=html.escape(described(read_frame(self.memory))))
+        text = _PAGE.format(width=SHOWN_WIDTH, text=html.escape(described(self.frame)))
         self._send("text/html; charset=utf-8", text.encode())
 
     def _state(self) -> None:
-        frame = read_frame(self.memory)
+        frame = self.frame
         numbers = {} if frame is None else frame.numbers
         self._send("application/json", json.dumps({**numbers, "text": described(frame)}).encode())
 
     def _image(self) -> None:
-        frame = read_frame(self.memory)
-        if frame is None:
+        if self.frame is None:
             self._nothing()
         else:
-            self._send("image/jpeg", enlarged(frame))
+            self._send("image/jpeg", enlarged(self.frame))
 
     def _nothing(self) -> None:
         self.send_error(404)
@@ -324,7 +259,7 @@ class _Page(BaseHTTPRequestHandler):
         self.end_headers()
         sent = None
         while True:
-            frame = read_frame(self.memory)
+            frame = self.frame
             if frame is not None and frame.numbers["tick"] != sent:
                 sent = frame.numbers["tick"]
                 data = enlarged(frame)
@@ -349,25 +284,26 @@ class _Server(ThreadingHTTPServer):
             super().handle_error(request, client_address)
 
 
-def serve(memory: int, listening: int) -> None:
-    """Serve the page until standard input closes, which happens when the flight's process ends for any reason.
+def serve(listening: int) -> None:
+    """Serve the page at a listening socket, given by its descriptor, and read frames from standard input.
 
-    Both arguments are descriptors: of the frame's file, and of the listening socket.
+    It ends with the input, which closes when the flight's process ends for any reason.
     """
     import PIL.Image  # noqa: F401  # what is missing is to be missed now
 
     os.nice(19)
-    _Page.memory = mmap.mmap(memory, ROOM, access=mmap.ACCESS_READ)
     server = _Server(("", 0), _Page, bind_and_activate=False)
     server.socket.close()
     server.socket = socket.socket(fileno=listening)
     threading.Thread(target=server.serve_forever, kwargs={"poll_interval": 0.1}, daemon=True).start()
     sys.stdout.write("ready\n")
     sys.stdout.flush()
-    sys.stdin.buffer.read()
+    with suppress(EOFError):
+        while True:
+            _Page.frame = Frame(*marshal.load(sys.stdin.buffer))
     server.shutdown()
     server.server_close()
 
 
 if __name__ == "__main__":
-    serve(int(sys.argv[1]), int(sys.argv[2]))
+    serve(int(sys.argv[1]))

@@ -31,7 +31,7 @@ from dreamer_racing.hil.progress import GateProgress
 from dreamer_racing.hil.safety import State, Verdict
 from dreamer_racing.hil.safety_limits import SafetyLimits
 from dreamer_racing.hil.vehicle import Command, Pose, at_rest, hover
-from dreamer_racing.hil.view import LiveView, read_frame
+from dreamer_racing.hil.view import LiveView
 
 IMAGE = np.zeros((64, 64, 3), np.uint8)
 IMAGE[:32], IMAGE[32:] = (255, 0, 0), (0, 0, 255)  # red above blue
@@ -58,9 +58,17 @@ def get(view: LiveView, path: str) -> bytes:
         return answer.read()
 
 
+def show(view: LiveView, shown: Outputs) -> None:
+    """Show a tick, and wait until the page has it."""
+    view.show(shown)
+    deadline = time.monotonic() + 10.0
+    while json.loads(get(view, "state")).get("tick") != view._shown and time.monotonic() < deadline:
+        time.sleep(0.01)
+
+
 def test_state_and_numbers_are_told_in_text(view):
     assert json.loads(get(view, "state")) == {"text": "no tick yet"}
-    view.show(outputs())
+    show(view, outputs())
     state = json.loads(get(view, "state"))
     assert (state["state"], state["armed"], state["target_gate"], state["passes"]) == ("flying", True, 3, 8)
     assert state["speed"] == 5.0 and state["position"] == [1.0, 2.0, 3.0]
@@ -76,7 +84,7 @@ def test_state_and_numbers_are_told_in_text(view):
 
 
 def test_without_pose_and_camera_it_says_why(view):
-    view.show(NO_POSE)
+    show(view, NO_POSE)
     text = json.loads(get(view, "state"))["text"]
     assert "speed     no pose" in text and "position  unknown m" in text and "the flyer has no camera" in text
     assert text.endswith("there is no pose\n<b> & more")
@@ -86,25 +94,25 @@ def test_without_pose_and_camera_it_says_why(view):
 
 
 def test_the_image_is_enlarged_and_the_right_way_up(view):
-    view.show(outputs())
+    show(view, outputs())
     image = Image.open(io.BytesIO(get(view, "image.jpg")))
     assert image.size == (512, 512)
     red, blue = image.getpixel((256, 200)), image.getpixel((256, 300))
     assert red == pytest.approx((255, 0, 0), abs=8) and blue == pytest.approx((0, 0, 255), abs=8)
     wide = np.zeros((20, 30, 4), np.uint8)[::-1, :, :3]  # neither square nor in one piece
     wide[:, :10] = (0, 255, 0)
-    view.show(outputs(wide))
+    show(view, outputs(wide))
     image = Image.open(io.BytesIO(get(view, "image.jpg")))
     assert image.size == (17 * 30, 17 * 20)
     assert image.getpixel((50, 100)) == pytest.approx((0, 255, 0), abs=8)
 
 
 def test_the_stream_has_each_new_image(view):
-    view.show(outputs())
+    show(view, outputs())
     with urllib.request.urlopen(view.address + "stream", timeout=10.0) as stream:
         assert stream.headers["Content-Type"].startswith("multipart/x-mixed-replace")
         for value in (200, 50):
-            view.show(outputs(np.full((64, 64, 3), value, np.uint8)))
+            show(view, outputs(np.full((64, 64, 3), value, np.uint8)))
             found = None
             while found is None or abs(found - value) > 3:  # an image from before may come first
                 assert stream.readline() == b"--frame\r\n"
@@ -116,7 +124,7 @@ def test_the_stream_has_each_new_image(view):
 
 
 def test_it_says_when_ticks_stop(view):
-    view.show(outputs())
+    show(view, outputs())
     time.sleep(1.2)
     assert json.loads(get(view, "state"))["text"].startswith("NO TICK FOR 1 s")
 
@@ -133,13 +141,8 @@ def test_a_port_in_use_is_said(view):
         LiveView(port=port)
 
 
-def test_whoever_else_may_see_it_is_said(caplog):
-    LiveView(port=0, host="0.0.0.0").close()
-    assert "everyone who can reach that address can see the flight" in caplog.text
-
-
 def test_it_closes_at_once_with_a_browser_at_it(view):
-    view.show(outputs())
+    show(view, outputs())
     with urllib.request.urlopen(view.address + "stream", timeout=10.0):
         start = time.monotonic()
         view.close()
@@ -152,28 +155,20 @@ def test_it_closes_at_once_with_a_browser_at_it(view):
     LiveView(port=int(view.address.rstrip("/").rpartition(":")[2])).close()  # the port is free
 
 
-def test_a_flight_goes_on_when_its_page_dies(view):
-    view._server.kill()
-    view._server.wait()
+@pytest.mark.parametrize("end", [signal.SIGKILL, signal.SIGSTOP])
+def test_a_flight_goes_on_when_its_page_dies_or_hangs(view, end):
+    os.kill(view._server.pid, end)
+    start = time.monotonic()
     for _ in range(100):
-        view.show(outputs())
+        view.show(outputs(np.zeros((500, 500, 3), np.uint8)))
+    assert time.monotonic() - start < 5.0
+    view.close()
 
 
-def test_an_image_without_room_is_left_out(view):
-    view.show(outputs(np.zeros((2000, 2000, 3), np.uint8)))
-    assert view.too_large == 1
+def test_a_large_image_is_shown_too(view):
+    show(view, outputs(np.zeros((2000, 2000, 3), np.uint8)))
     assert json.loads(get(view, "state"))["shape"] == [2000, 2000, 3]
-    assert len(get(view, "image.jpg")) > 100
-
-
-def test_a_frame_that_is_being_written_is_not_read(view):
-    view.show(outputs())
-    assert read_frame(view._memory).numbers["tick"] == 1
-    view._memory[:4] = (3).to_bytes(4, "little")
-    assert read_frame(view._memory, tries=2) is None
-    view._memory[:4] = (2).to_bytes(4, "little")
-    view._memory[20:21] = b"\xff"  # within the numbers
-    assert read_frame(view._memory, tries=2) is None
+    assert Image.open(io.BytesIO(get(view, "image.jpg"))).size == (2000, 2000)
 
 
 KILLED = """
