@@ -11,6 +11,7 @@ instead of the firmware; `gap` is `lap` / `model` − 1.
 """
 
 from collections.abc import Iterator, Sequence
+from contextlib import closing
 from pathlib import Path
 from typing import Any
 
@@ -46,7 +47,7 @@ def main() -> None:
     arguments = parser.parse_args()
     contract = read_contract(AGENTS / "circle" / "contract.json")  # the firmware settings are the same for all flyers
     records = []
-    with SteppedFirmware(find_firmware(), print_settings(contract, "betaflight_sitl")) as firmware:
+    with closing(SteppedFirmware(find_firmware(), print_settings(contract, "betaflight_sitl"))) as firmware:
         for name in arguments.flyers:
             for track in tracks_of(name):
                 records.append(measure(name, track, firmware, arguments.flights))
@@ -91,18 +92,10 @@ def fly(name: str, track: str, flights: int, firmware: SteppedFirmware | None) -
         flyer = PilotFlyer(vehicle.track, "faithful") if name == "pilot" else ActorFlyer(AGENTS / name)
         limits = SafetyLimits.of_track(vehicle.track)
         chain = FlightChain(flyer, vehicle.track, ChainConfig(limits, laps=LAPS, arm=True))
-        top, sleep = [0.0], step.sleep_until
-
-        def note(deadline: float, vehicle: PlantVehicle = vehicle, top: list[float] = top, sleep: Any = sleep) -> None:
-            sleep(deadline)
-            if vehicle.armed:
-                top.append(float(np.linalg.norm(vehicle.pose().linear_velocity)))
-
-        step.sleep_until = note  # type: ignore[method-assign]  # to see each step
         ended = step.fly(chain, flyer.rate, PATIENCE)
         chain.close()
         finished = ended == "disarmed: the flight is over" and len(vehicle.lap_times) == LAPS
-        yield list(vehicle.lap_times) if finished else [], max(top)
+        yield list(vehicle.lap_times) if finished else [], step.speed_max
 
 
 def through(firmware: SteppedFirmware, vehicle: PlantVehicle, delivery: Delivery) -> FirmwareStep:

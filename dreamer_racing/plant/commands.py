@@ -12,8 +12,7 @@ from dreamer_racing.plant.vehicle import PlantVehicle
 
 logger = logging.getLogger(__name__)
 
-TIMEOUT = 0.25
-"""s without a valid message after which motors are cut [choice]: twelve commands at 50 Hz."""
+TIMEOUT = 0.25  # s without a valid message after which motors are cut [choice]: twelve commands at 50 Hz
 
 
 class Failsafe:

@@ -10,7 +10,6 @@ import socket
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
 from pathlib import Path
-from typing import Self
 
 from dreamer_racing.hil.battery import Reading
 from dreamer_racing.hil.betaflight.firmware import Firmware, Ports
@@ -20,7 +19,6 @@ from dreamer_racing.hil.vehicle import Command, at_rest
 from dreamer_racing.plant.betaflight_sitl import BetaflightSitl
 from dreamer_racing.plant.delivery import Delivery
 from dreamer_racing.plant.lock_step import LockStep
-from dreamer_racing.plant.process import Plant
 from dreamer_racing.plant.vehicle import PlantVehicle
 
 READY_AFTER = 1.5
@@ -32,7 +30,7 @@ _PATIENCE = 20.0  # s for a step; it takes 0.1 ms
 
 
 class SteppedFirmware:
-    """A `Firmware` in simulated time, which has its arguments; a context manager starts and stops it.
+    """A `Firmware` in simulated time, which has its arguments.
 
     Attributes:
         firmware: The process.
@@ -93,15 +91,6 @@ class SteppedFirmware:
         self._motors.close()
         self._out.close()
 
-    def __enter__(self) -> Self:
-        """Start it."""
-        self.start()
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        """Stop it."""
-        self.close()
-
 
 class Radio:
     """A `Transport` of channels to a firmware, which can be disconnected.
@@ -147,10 +136,8 @@ class FirmwareStep(LockStep):
     def __init__(
         self, vehicle: PlantVehicle, firmware: SteppedFirmware, link: TransportLink, delivery: Delivery | None = None
     ) -> None:
-        super().__init__(vehicle, delivery)
+        super().__init__(vehicle, delivery, BetaflightSitl(vehicle, self._exchange, firmware.firmware.release))
         self._firmware, self._link = firmware, link
-        self.controls = BetaflightSitl(vehicle, self._exchange, firmware.firmware.release)
-        self.plant = Plant(vehicle, self.controls, delivery or Delivery(), self._deliver)
         self.disarmed_at: float | None = None
         self.after_step: Callable[[], None] = lambda: None
 

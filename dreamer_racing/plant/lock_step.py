@@ -14,7 +14,7 @@ from dreamer_racing.hil.operator import Operator
 from dreamer_racing.hil.pose import Received, decode_pose
 from dreamer_racing.hil.recording import FlightRecorder
 from dreamer_racing.hil.vehicle import Command
-from dreamer_racing.plant.commands import CommandReceiver
+from dreamer_racing.plant.commands import CommandReceiver, Controls
 from dreamer_racing.plant.delivery import Delivery
 from dreamer_racing.plant.process import Plant
 from dreamer_racing.plant.vehicle import PlantVehicle
@@ -22,8 +22,7 @@ from dreamer_racing.plant.vehicle import PlantVehicle
 CLOCK_OFFSET = 1000.0
 """s, by the loop's clock, when the plant's physics began: not 0, so that mixing up the clocks shows."""
 
-ENABLE_AFTER = 0.5
-"""s after which the operator gives the enable [choice]."""
+ENABLE_AFTER = 0.5  # s after which the operator gives the enable [choice]
 
 
 class LockStep:
@@ -31,12 +30,16 @@ class LockStep:
 
     Attributes:
         plant: The drone, with its controls and pose delivery.
+        speed_max: m/s, highest speed at the ticks while armed: a fall after the flight does not count.
         enable_after: s after which the operator gives the enable.
         killed: Whether the operator kills; settable.
     """
 
-    def __init__(self, vehicle: PlantVehicle, delivery: Delivery | None = None) -> None:
-        self.plant = Plant(vehicle, CommandReceiver(vehicle), delivery or Delivery(), self._deliver)
+    def __init__(
+        self, vehicle: PlantVehicle, delivery: Delivery | None = None, controls: Controls | None = None
+    ) -> None:
+        self.plant = Plant(vehicle, controls or CommandReceiver(vehicle), delivery or Delivery(), self._deliver)
+        self.speed_max = 0.0
         self.enable_after, self.killed = ENABLE_AFTER, False
         self.poses, self.operator = _Poses(), _Operator(self)
         self._sequence = 0
@@ -53,6 +56,9 @@ class LockStep:
     def sleep_until(self, deadline: float) -> None:
         """Let the plant fly until a time."""
         self.plant.advance_to(deadline - CLOCK_OFFSET)
+        if self.plant.vehicle.armed:
+            velocity = self.plant.vehicle.pose().linear_velocity
+            self.speed_max = max(self.speed_max, float((velocity @ velocity) ** 0.5))
 
     def send(self, command: Command) -> bytes:
         """Send a command to the plant; return its packet."""

@@ -12,7 +12,6 @@ from dreamer_racing.envs.drone.parameters import (
     without_randomisation,
 )
 from dreamer_racing.envs.race.pilot import ScriptedPilot
-from dreamer_racing.envs.race.racing_line import LineLimits
 from dreamer_racing.envs.simulator.scene import Camera
 from dreamer_racing.envs.tracks import Track
 from dreamer_racing.hil.vehicle import Pose, Setpoint
@@ -25,21 +24,14 @@ class PilotFlyer:
         track: To fly.
         preset: Vehicle model that the pilot assumes.
         rate: Hz, of its setpoints.
-        limits: Of the racing line; None for the pilot's own.
     """
 
     camera: Camera | None = None
 
-    def __init__(
-        self,
-        track: Track,
-        preset: str | QuadrotorParameters = "faithful",
-        rate: float = 50.0,
-        limits: LineLimits | None = None,
-    ) -> None:
+    def __init__(self, track: Track, preset: str | QuadrotorParameters = "faithful", rate: float = 50.0) -> None:
         self.rate = rate
         parameters = at_control_rate(without_randomisation(load_preset(preset)), rate)
-        self._pilot = ScriptedPilot(track, parameters, limits)
+        self._pilot = ScriptedPilot(track, parameters)
         self._thrust_scale = parameters.collective_thrust_scale
         self._rate_max = np.array(parameters.body_rate_max)
 

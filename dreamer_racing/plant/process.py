@@ -30,9 +30,7 @@ from dreamer_racing.training.signals import GracefulExit
 
 logger = logging.getLogger(__name__)
 
-LATE = 0.005
-"""s behind the clock from which an event counts as late [choice]: the time between two poses at 200 Hz."""
-
+LATE = 0.005  # s behind the clock from which an event counts as late [choice]: the time between two poses at 200 Hz
 _PATIENCE = 0.1  # s, between two checks of whether to stop
 _LONGEST = 2048  # bytes of a datagram that are read: more than any valid one has
 _ROUNDING = 1e-9  # s
@@ -126,12 +124,6 @@ class Plant:
         """Process a datagram as it arrives; return whether it was accepted."""
         return self.controls.take(data, self.time)
 
-    def note_delay(self, delay: float) -> None:
-        """Note by how much an event is behind the clock, s."""
-        if delay > LATE:
-            self.late += 1
-            self.latest = max(self.latest, delay)
-
     def summary(self) -> str:
         """Return one line on what happened."""
         vehicle = self.vehicle
@@ -155,7 +147,9 @@ def fly_in_real_time(
     start = time.monotonic() - plant.time / speed
     while not stop.requested and plant.time < duration:
         wait = start + min(plant.due, duration) / speed - time.monotonic()
-        plant.note_delay(-wait)
+        if -wait > LATE:
+            plant.late += 1
+            plant.latest = max(plant.latest, -wait)
         if select.select([incoming], [], [], min(max(wait, 0.0), _PATIENCE))[0]:
             now = min((time.monotonic() - start) * speed, duration)
             if now < plant.due + LATE * speed:  # else physics is late: as if datagrams arrived at its present time

@@ -29,8 +29,7 @@ SWEEPS: dict[str, tuple[float, ...]] = {
 DEFAULT_DELIVERY = Delivery(rate=200.0, jitter=0.002, packet_loss=0.01, position_noise=0.001, attitude_noise=0.003)
 """Poses as a motion-capture system gives them [choice]; without noise every flight would be the same."""
 
-LONGEST = 60.0
-"""s after which a flight is ended."""
+LONGEST = 60.0  # s after which a flight is ended
 
 LIMITS = {"speed_max": 25.0, "velocity_tolerance": 20.0}
 """m/s, safety limits that differ from the defaults: the pilot is faster than a first flight should be, and the study
@@ -75,8 +74,7 @@ def study(
         yield from pool.map(_fly, *zip(*jobs, strict=True))
 
 
-_prepared: dict[str, Any] = {}
-"""Flyer, track and preset of this process, kept because a flyer takes seconds to make."""
+_prepared: dict[str, Any] = {}  # flyer, track and preset of this process, kept because a flyer takes seconds to make
 
 
 def _prepare(make_flyer: Callable[[], Flyer], track: Track, preset: str) -> None:
@@ -97,7 +95,7 @@ def fly(flyer: Flyer, track: Track, preset: str, sweep: str, value: float, seed:
     laps = vehicle.track.laps
     limits = SafetyLimits.of_track(vehicle.track, **LIMITS)
     chain = FlightChain(flyer, vehicle.track, ChainConfig(limits, laps=laps, arm=True))
-    plant = _Fastest(vehicle, delivery)
+    plant = LockStep(vehicle, delivery)
     try:
         ended = plant.fly(chain, flyer.rate, LONGEST)
     finally:
@@ -113,16 +111,3 @@ def fly(flyer: Flyer, track: Track, preset: str, sweep: str, value: float, seed:
         speed_max=plant.speed_max,
         ended=ended,
     )
-
-
-class _Fastest(LockStep):
-    """A `LockStep` that notes the highest speed, m/s."""
-
-    speed_max = 0.0
-
-    def sleep_until(self, deadline: float) -> None:
-        super().sleep_until(deadline)
-        if not self.plant.vehicle.armed:
-            return  # a fall after the flight does not count
-        velocity = self.plant.vehicle.pose().linear_velocity
-        self.speed_max = max(self.speed_max, float((velocity @ velocity) ** 0.5))

@@ -26,17 +26,13 @@ from dreamer_racing.settings import Range, setting
 
 logger = logging.getLogger(__name__)
 
-LIFT_OFF = 0.5
-"""Share of a drone's weight that commanded thrust must exceed before the stand releases it [choice]."""
+LIFT_OFF = 0.5  # share of a drone's weight that commanded thrust must exceed before the stand releases it [choice]
 
 HOVER_SHARE = 0.99
 """Share of a drone's weight that must be commanded, as long, before the stand lets it sink: hover thrust, rounded."""
 
-STAND_RADIUS = 0.1
-"""m from its start, sideways, within which the stand supports a released drone [choice]."""
-
-SPIN_UP = 5.0
-"""Motor lags for which that thrust must be commanded: rotors then give 98.7 % of it [choice]."""
+STAND_RADIUS = 0.1  # m from its start, sideways, within which the stand supports a released drone [choice]
+SPIN_UP = 5.0  # motor lags for which that thrust must be commanded: rotors then give 98.7 % of it [choice]
 
 
 @dataclass

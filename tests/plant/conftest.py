@@ -9,9 +9,23 @@ from dreamer_racing.export.onnx_actor import read_contract
 from dreamer_racing.hil.betaflight import print_settings
 from dreamer_racing.hil.betaflight.firmware import find_firmware
 from dreamer_racing.plant.firmware_step import SteppedFirmware
+from dreamer_racing.plant.vehicle import PlantVehicle
 
 CONTRACT = Path(__file__).parents[2] / "agents" / "circle" / "contract.json"
 YAW = ("set p_yaw = 30", "set i_yaw = 5")  # of link=betaflight_sitl: the plant's rotors have no torque of speeding up
+
+
+@pytest.fixture(scope="session")
+def vehicle() -> PlantVehicle:
+    """A drone without delay; a test gets it from `fresh`."""
+    return PlantVehicle("circle", "easy")
+
+
+@pytest.fixture
+def fresh(vehicle: PlantVehicle) -> PlantVehicle:
+    """The drone on its stand."""
+    vehicle.reset()
+    return vehicle
 
 
 @pytest.fixture(scope="session")

@@ -6,6 +6,7 @@ import math
 import struct
 from collections.abc import Callable
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -22,8 +23,7 @@ from dreamer_racing.hil.sticks import ThrustMap
 from dreamer_racing.hil.vehicle import Command, Pose
 from dreamer_racing.plant.betaflight_sitl import CONVENTIONS, BetaflightSitl, convention_of, decode_motors, encode_state
 from dreamer_racing.plant.delivery import Delivery
-from dreamer_racing.plant.firmware_step import Radio
-from dreamer_racing.plant.lock_step import LockStep
+from dreamer_racing.plant.firmware_step import FirmwareStep, Radio
 from dreamer_racing.plant.pilot import PilotFlyer
 from dreamer_racing.plant.process import Plant
 from dreamer_racing.plant.vehicle import PlantVehicle
@@ -206,29 +206,22 @@ class RecordedRadio(Radio):
         return super().write(data)
 
 
-class SitlStep(LockStep):
-    """A plant that a firmware flies by its motors, and the loop by the firmware's radio; time is the physics'."""
+class SitlStep(FirmwareStep):
+    """A plant that the stand-in of a firmware flies by its motors, and the loop by the firmware's radio."""
 
     def __init__(self, version: str) -> None:
-        vehicle = PlantVehicle("circle", "faithful")
-        super().__init__(vehicle)
         self.firmware = Firmware(version)
-        controls = BetaflightSitl(vehicle, lambda data: self.plant.take(self.firmware.answer(data)), version)
-        self.plant = Plant(vehicle, controls, Delivery(), self._deliver)
+        stepped = SimpleNamespace(
+            firmware=SimpleNamespace(release=version), exchange=lambda state: [self.firmware.answer(state)]
+        )
         self.radio = RecordedRadio(self.firmware)
-        self._link = ChannelLink(self.radio, encode_sitl, RATES, THRUST)
+        link = ChannelLink(self.radio, encode_sitl, RATES, THRUST)
+        super().__init__(PlantVehicle("circle", "faithful"), stepped, link)
         self.pull_after: float | None = None  # s
-        self.disarmed_at: float | None = None  # s, after it was armed
 
     def send(self, command: Command) -> bytes:
         self.radio.disconnected = self.pull_after is not None and self.elapsed >= self.pull_after
-        return self._link.send(command)
-
-    def sleep_until(self, deadline: float) -> None:
-        was_armed = self.plant.vehicle.armed
-        super().sleep_until(deadline)
-        if was_armed and not self.plant.vehicle.armed and self.disarmed_at is None:
-            self.disarmed_at = self.elapsed
+        return super().send(command)
 
 
 def pilot_on(step: SitlStep, laps: int) -> FlightChain:

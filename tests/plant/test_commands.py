@@ -20,61 +20,51 @@ def packet(sequence: int, armed: bool = True, thrust: float = GRAVITY) -> bytes:
     return encode_command(CommandPacket(sequence, 0.0, Command(armed, Setpoint(thrust, np.zeros(3)))))
 
 
-@pytest.fixture(scope="module")
-def vehicle() -> PlantVehicle:
-    """A drone on its stand; without delay."""
-    return PlantVehicle("circle", "easy")
-
-
 def armed_after(vehicle: PlantVehicle) -> bool:
     vehicle.advance(0.002)
     return vehicle.armed
 
 
-def test_it_arms_after_a_disarmed_command_only(vehicle: PlantVehicle, caplog: pytest.LogCaptureFixture) -> None:
-    vehicle.reset()
-    receiver = CommandReceiver(vehicle)
+def test_it_arms_after_a_disarmed_command_only(fresh: PlantVehicle, caplog: pytest.LogCaptureFixture) -> None:
+    receiver = CommandReceiver(fresh)
     for sequence in range(3):
         assert receiver.take(packet(sequence), 0.0)
-    assert not armed_after(vehicle)
+    assert not armed_after(fresh)
     assert caplog.text.count("armed before any disarmed message") == 1  # once is enough
     receiver.take(packet(3, armed=False), 0.0)
-    assert not armed_after(vehicle)
+    assert not armed_after(fresh)
     receiver.take(packet(4), 0.0)
-    assert armed_after(vehicle)
+    assert armed_after(fresh)
 
 
-def test_silence_cuts_the_motors_at_its_time_until_disarmed_and_armed_again(vehicle: PlantVehicle) -> None:
-    vehicle.reset()
-    receiver = CommandReceiver(vehicle, timeout=0.3)
+def test_silence_cuts_the_motors_at_its_time_until_disarmed_and_armed_again(fresh: PlantVehicle) -> None:
+    receiver = CommandReceiver(fresh, timeout=0.3)
     assert receiver.due == np.inf  # nothing to cut
     receiver.take(packet(0, armed=False), 1.0)
     receiver.take(packet(1), 1.1)
     assert receiver.due == pytest.approx(1.4)
     receiver.act(1.39)
-    assert armed_after(vehicle) and receiver.failsafe.events == 0
+    assert armed_after(fresh) and receiver.failsafe.events == 0
     receiver.act(receiver.due)
-    assert not armed_after(vehicle) and receiver.failsafe.events == 1 and receiver.due == np.inf
+    assert not armed_after(fresh) and receiver.failsafe.events == 1 and receiver.due == np.inf
     receiver.act(2.0)
     receiver.take(packet(2), 2.1)
-    assert not armed_after(vehicle) and receiver.failsafe.events == 1
+    assert not armed_after(fresh) and receiver.failsafe.events == 1
     receiver.take(packet(3, armed=False), 2.2)
     receiver.take(packet(4), 2.2)
-    assert armed_after(vehicle)
+    assert armed_after(fresh)
 
 
-def test_lost_and_stale_commands_are_counted_across_the_end_of_the_sequence(vehicle: PlantVehicle) -> None:
-    vehicle.reset()
-    receiver = CommandReceiver(vehicle)
+def test_lost_and_stale_commands_are_counted_across_the_end_of_the_sequence(fresh: PlantVehicle) -> None:
+    receiver = CommandReceiver(fresh)
     for sequence in (2**32 - 3, 2**32 - 1, 2**32 - 2, 2**32 - 1, 1):
         receiver.take(packet(sequence, armed=False), 0.0)
     assert (receiver.received, receiver.lost, receiver.stale) == (3, 2, 2)
     assert "3 commands (2 lost, 2 stale, 0 malformed), 0 failsafe(s)" in receiver.summary()
 
 
-def test_a_sender_that_begins_anew_is_heard_after_the_failsafe(vehicle: PlantVehicle) -> None:
-    vehicle.reset()
-    receiver = CommandReceiver(vehicle)
+def test_a_sender_that_begins_anew_is_heard_after_the_failsafe(fresh: PlantVehicle) -> None:
+    receiver = CommandReceiver(fresh)
     receiver.take(packet(5000, armed=False), 0.0)
     assert not receiver.take(packet(0, armed=False), 0.1)
     receiver.act(0.25)

@@ -25,18 +25,6 @@ from dreamer_racing.settings import check_settings
 from dreamer_racing.training.signals import GracefulExit
 
 
-@pytest.fixture(scope="module")
-def vehicle() -> PlantVehicle:
-    """The drone; a test gets it from `fresh`."""
-    return PlantVehicle("circle", "easy")
-
-
-@pytest.fixture
-def fresh(vehicle: PlantVehicle) -> PlantVehicle:
-    vehicle.reset()
-    return vehicle
-
-
 @pytest.fixture
 def incoming() -> Iterator[socket.socket]:
     with bind("127.0.0.1", 0) as listening:

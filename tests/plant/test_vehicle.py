@@ -12,6 +12,7 @@ from dreamer_racing.envs.drone.parameters import GRAVITY, PRESETS, without_rando
 from dreamer_racing.envs.race.gates import CrashCause
 from dreamer_racing.envs.simulator.mujoco_cpu import MujocoSimulator
 from dreamer_racing.envs.tracks import load_track
+from dreamer_racing.hil.flyer import Flyer
 from dreamer_racing.hil.vehicle import Command, Setpoint, at_rest, hover
 from dreamer_racing.plant.pilot import PilotFlyer
 from dreamer_racing.plant.study import fly
@@ -306,21 +307,10 @@ def test_a_command_that_is_not_finite_is_refused() -> None:
 # A study's flights: one thing is changed, the rest stays, and a seed gives the same flight again.
 
 
-class Hover:
-    rate, camera = 50.0, None
-
-    def reset(self):
-        pass
-
-    def act(self, pose, image, target_gate):
-        return hover()
-
-    def prepare(self):
-        pass
-
-
 def test_what_ends_at_once_is_said_and_repeats():
-    class Fall(Hover):
+    class Fall(Flyer):
+        rate, camera = 50.0, None
+
         def act(self, pose, image, target_gate):
             return hover()._replace(collective_thrust=7.0, body_rates=np.array([1.0, 0.0, 0.0]))
 
