@@ -7,8 +7,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-Numbers = Sequence[float] | np.ndarray
-"""A quaternion, (4,) wxyz."""
+Numbers = Sequence[float] | np.ndarray  # a quaternion, (4,) wxyz
 
 
 def product(first: Numbers, second: Numbers) -> tuple[float, ...]:

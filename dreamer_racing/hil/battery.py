@@ -12,8 +12,7 @@ from typing import Any, NamedTuple
 
 from dreamer_racing.settings import ALLOWED, POSITIVE, Range, check_settings, setting
 
-STALE = 2.0
-"""s without a plausible reading after which the voltage counts as old [choice]; it keeps its value."""
+STALE = 2.0  # s without a plausible reading after which the voltage counts as old [choice]; it keeps its value
 
 
 class Reading(NamedTuple):
@@ -74,7 +73,11 @@ class Battery:
         for time, voltage in readings:
             if low <= voltage <= high:
                 self.readings += 1
-                self.voltage += self._gain(time) * (voltage - self.voltage)
+                if self._heard_at is None or self.config.smoothing == 0.0:
+                    gain = 1.0
+                else:  # exact for a voltage that is constant from one reading to the next
+                    gain = -math.expm1(-max(time - self._heard_at, 0.0) / self.config.smoothing)
+                self.voltage += gain * (voltage - self.voltage)
                 self._heard_at = time
             else:
                 self.implausible += 1
@@ -86,12 +89,6 @@ class Battery:
         """Return counts of readings and the age of the last one, s, as JSON values; an age of None: there was none."""
         age = self.age if math.isfinite(self.age) else None
         return {"readings": self.readings, "implausible": self.implausible, "last_reading_age_s": age}
-
-    def _gain(self, time: float) -> float:
-        """Return the low-pass gain, exact for a voltage that is constant from one reading to the next."""
-        if self._heard_at is None or self.config.smoothing == 0.0:
-            return 1.0
-        return -math.expm1(-max(time - self._heard_at, 0.0) / self.config.smoothing)
 
 
 def battery_words(battery: dict[str, Any]) -> str:

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from dreamer_racing.envs.drone.parameters import QuadrotorParameters
-from dreamer_racing.envs.simulator.opengl import GL_LIBRARIES, RendererUnavailableError, open_scene, require_library
+from dreamer_racing.envs.simulator.opengl import GL_LIBRARIES, RendererUnavailableError, open_scene
 from dreamer_racing.envs.simulator.scene import Camera, build_scene
 from dreamer_racing.envs.tracks import Track
 from dreamer_racing.hil.attitude import rotation_matrix
@@ -31,15 +31,12 @@ class NoseCamera:
         check_choice("renderer", backend, ("auto", *GL_LIBRARIES))
         model = build_scene(track, QuadrotorParameters(), camera).compile()
         reasons = []
-        for candidate in GL_LIBRARIES if backend == "auto" else (backend,):
+        for self.backend in GL_LIBRARIES if backend == "auto" else (backend,):
             try:
-                require_library(candidate)
-                self._scene = open_scene(candidate, model, camera)
+                self._scene = open_scene(self.backend, model, camera)
+                break
             except RendererUnavailableError as error:
                 reasons.append(str(error))
-                continue
-            self.backend = candidate
-            break
         else:
             raise RendererUnavailableError(" ".join(reasons))
         tilt = math.radians(camera.tilt)

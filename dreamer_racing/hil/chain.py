@@ -26,7 +26,6 @@ from dreamer_racing.hil.progress import GateProgress
 from dreamer_racing.hil.safety import Safety, SafetyLimits, Tick, Verdict
 from dreamer_racing.hil.stamping import PoseClock, Stamping, extrapolate
 from dreamer_racing.hil.vehicle import GRAVITY, Pose, Setpoint
-from dreamer_racing.settings import Range, check_setting
 
 LIFT = 1.35
 """Multiple of the weight to which take-off thrust ramps up within `SafetyLimits.lift_time` [choice]. It starts at 1: a
@@ -37,18 +36,13 @@ LIFT_LEAST, LIFT_MOST = 1.1, 1.5
 
 RISE_TIME = 0.04
 """s for which all poses must show the vehicle rising before its flyer takes over [choice]: the false velocity after a
-jump of 0.1 m, the largest that safety accepts, has decayed by then (`PoseConfig.smoothing`)."""
+jump of 0.1 m, the largest that safety accepts, has decayed by then (`HilConfig.smoothing`)."""
 
-RISE_HEIGHT = 0.01
-"""m above its stand that the vehicle must have reached by then [choice]."""
+RISE_HEIGHT = 0.01  # m above its stand that the vehicle must have reached by then [choice]
 
 START_RATE = 2.0
 """rad/s above which even a slow vehicle has left the start [choice]: racers turn before they move, and in training no
 episode begins, with empty memory, in a tilted vehicle. Noise of estimated rates stays below."""
-
-
-LATENCY = Range(0, 1)
-"""Allowed latency of poses, s."""
 
 
 class ChainConfig(NamedTuple):
@@ -110,8 +104,8 @@ class FlightChain:
         renderer: As in `NoseCamera`.
 
     Raises:
-        ValueError: The latency is out of range, the camera's frame rate does not fit the flyer's rate, or the lift is
-            not within its range and safety's limits.
+        ValueError: The camera's frame rate does not fit the flyer's rate, or the lift is not within its range and
+            safety's limits.
         RendererUnavailableError: The camera's images cannot be rendered here.
 
     Attributes:
@@ -123,7 +117,6 @@ class FlightChain:
     """
 
     def __init__(self, flyer: Flyer, track: Track, config: ChainConfig, renderer: str = "auto") -> None:
-        check_setting("latency", config.latency, LATENCY)
         self.progress = GateProgress(track, config.limits)
         self.clock = PoseClock(config.stamping, config.latency, config.limits.clock_drift_max)
         self.safety = Safety(config.limits)

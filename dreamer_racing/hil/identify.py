@@ -16,8 +16,7 @@ from dreamer_racing.envs.simulator.scene import Camera
 from dreamer_racing.hil.attitude import rotation_matrix
 from dreamer_racing.hil.vehicle import GRAVITY, Pose, Setpoint
 
-RATE = 100.0
-"""Hz, of commands: as often as a radio accepts them."""
+RATE = 100.0  # Hz, of commands: as often as a radio accepts them
 
 AXES = ("roll", "pitch", "yaw", "thrust")
 AMPLITUDES = {"roll": (1.0, 2.0, 4.0), "pitch": (1.0, 2.0, 4.0), "yaw": (0.7, 1.4, 2.1), "thrust": (1.5, 3.0, 4.5)}
@@ -25,21 +24,14 @@ AMPLITUDES = {"roll": (1.0, 2.0, 4.0), "pitch": (1.0, 2.0, 4.0), "yaw": (0.7, 1.
 HOLD = {"roll": 0.10, "pitch": 0.10, "yaw": 0.30, "thrust": 0.12}
 """s for which the first and third of three steps are held; the second is opposite and twice as long, so that the
 vehicle ends where it was, and nearly at rest [choice]."""
-REST = 1.0
-"""s between two triples, in which the vehicle returns to its place [choice]."""
-SETTLE = 2.0
-"""s of hover before the first step and after the last [choice]."""
-RANDOM = 4.0
-"""s of steps of random sign per axis, which reveal delays better [choice]."""
-RANDOM_HOLD = 0.05, 0.15
-"""s, shortest and longest of these steps [choice]."""
-
-HEIGHT = 0.3
-"""m of the hover above the start [choice]."""
+REST = 1.0  # s between two triples, in which the vehicle returns to its place [choice]
+SETTLE = 2.0  # s of hover before the first step and after the last [choice]
+RANDOM = 4.0  # s of steps of random sign per axis, which reveal delays better [choice]
+RANDOM_HOLD = 0.05, 0.15  # s, shortest and longest of these steps [choice]
+HEIGHT = 0.3  # m of the hover above the start [choice]
 KP, KD, KA, KYAW = 3.0, 3.0, 6.0, 2.0
 """Gains of the hover, in 1/s², 1/s, 1/s and 1/s: slow compared with any usable rate loop [choice]."""
-SIDEWAYS = 3.0
-"""m/s², largest sideways acceleration [choice]."""
+SIDEWAYS = 3.0  # m/s², largest sideways acceleration [choice]
 
 
 class Step(NamedTuple):
@@ -51,7 +43,7 @@ class Step(NamedTuple):
     value: float  # rad/s or m/s²
 
 
-def make_schedule(seed: int = 0) -> list[Step]:
+def make_schedule() -> list[Step]:
     """Return the steps of a flight, in order."""
     steps, time = [], SETTLE
     for axis, name in enumerate(AXES):
@@ -62,7 +54,7 @@ def make_schedule(seed: int = 0) -> list[Step]:
                     steps.append(Step(time, end, axis, share * amplitude))
                     time = end
                 time += REST
-        for begin, end, sign in _draw(time, seed + axis):
+        for begin, end, sign in _draw(time, axis):
             steps.append(Step(begin, end, axis, sign * AMPLITUDES[name][1]))
             time = end
         time += REST

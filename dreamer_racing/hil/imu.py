@@ -16,8 +16,7 @@ from dreamer_racing.hil.packets import PacketFormat
 
 PACKET = PacketFormat(b"DRI1", "Id6d")
 
-LARGEST = 1e4
-"""rad/s or m/s² beyond which a number is no measurement of a drone [choice]."""
+LARGEST = 1e4  # rad/s or m/s² beyond which a number is no measurement of a drone [choice]
 
 AT_REST = 0.25
 """Share by which the specific force of a resting vehicle may differ from gravity [choice]; a wrong scale is off by at

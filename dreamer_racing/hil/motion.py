@@ -10,8 +10,7 @@ from collections import deque
 from typing import ClassVar, NamedTuple
 
 from dreamer_racing.hil.attitude import conjugate, product
-from dreamer_racing.hil.reasons import Findings, Reason
-from dreamer_racing.hil.safety_limits import SafetyLimits, Vector, to_number, to_numbers
+from dreamer_racing.hil.safety_limits import Findings, Reason, SafetyLimits, Vector, to_number, to_numbers
 from dreamer_racing.hil.vehicle import Pose
 
 

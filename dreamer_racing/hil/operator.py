@@ -20,16 +20,12 @@ from typing import IO, Any, NamedTuple, Protocol
 from dreamer_racing.hil.inlet import UdpInlet
 from dreamer_racing.hil.packets import PacketFormat
 
-PACKET = PacketFormat(b"DRO1", "IBB")
-"""Sequence number u32, enable u8, kill u8."""
+PACKET = PacketFormat(b"DRO1", "IBB")  # sequence number u32, enable u8, kill u8
 
 PORT = 9102
-DEAD_MAN = 0.5
-"""s without a packet after which the enable counts as released [choice]; send ten a second or more."""
-SEND_RATE = 20.0
-"""Hz at which the switch of this file sends [choice]."""
-KILLS = 20
-"""Kill packets that the switch sends before it ends [choice]: radios lose some."""
+DEAD_MAN = 0.5  # s without a packet after which the enable counts as released [choice]; send ten a second or more
+SEND_RATE = 20.0  # Hz at which the switch of this file sends [choice]
+KILLS = 20  # kill packets that the switch sends before it ends [choice]: radios lose some
 
 logger = logging.getLogger(__name__)
 

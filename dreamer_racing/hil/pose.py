@@ -16,8 +16,7 @@ from dreamer_racing.hil.packets import PacketFormat
 
 PACKET = PacketFormat(b"DRP1", "Id13d")
 
-LARGEST = 1e6
-"""m, m/s, rad/s or rad beyond which a number is no measurement of a drone [choice]."""
+LARGEST = 1e6  # m, m/s, rad/s or rad beyond which a number is no measurement of a drone [choice]
 
 
 class PosePacket(NamedTuple):

@@ -22,8 +22,15 @@ import numpy as np
 
 from dreamer_racing.hil.motion import Motion, read_pose
 from dreamer_racing.hil.operator import Operator
-from dreamer_racing.hil.reasons import Findings, Reason
-from dreamer_racing.hil.safety_limits import SafetyLimits, Vector, is_within, to_number, to_numbers
+from dreamer_racing.hil.safety_limits import (
+    Findings,
+    Reason,
+    SafetyLimits,
+    Vector,
+    is_within,
+    to_number,
+    to_numbers,
+)
 from dreamer_racing.hil.vehicle import Command, Pose, Setpoint, at_rest, hover
 
 
@@ -73,11 +80,6 @@ class Verdict(NamedTuple):
     reasons: tuple[Reason, ...]  # why it cut, why it holds, or why it does not arm
     words: tuple[str, ...]  # a message for a person for each reason
 
-    @property
-    def refusals(self) -> tuple[str, ...]:
-        """Why it does not arm, in words; empty where it is armed."""
-        return () if self.command.armed else self.words
-
 
 class Safety:
     """Decides at each tick of the loop whether motors may turn and what is sent; it never raises after construction.
@@ -91,7 +93,7 @@ class Safety:
     Example:
         >>> limits = SafetyLimits(fence_low=(-9, -8, -1), fence_high=(9, 8, 5), start_position=(0, 0, 0))
         >>> verdict = Safety(limits).step(Tick(0.0, None, 0.0, None, Operator(enable=False, kill=False), True))
-        >>> verdict.state, verdict.command.armed, verdict.refusals[0]
+        >>> verdict.state, verdict.command.armed, verdict.words[0]
         (<State.DISARMED: 'disarmed'>, False, 'the operator does not give the enable')
     """
 
@@ -284,7 +286,8 @@ class Safety:
             self._upright_at = self._now
             return findings
         if not is_within(seen.position, limits.fence_low, limits.fence_high):
-            findings[Reason.GEOFENCE] = f"at {_format_point(seen.position)} m it is outside the fence"
+            at = ", ".join(f"{value:.3g}" for value in seen.position)
+            findings[Reason.GEOFENCE] = f"at ({at}) m it is outside the fence"
         if seen.speed > limits.speed_max:
             findings[Reason.SPEED] = f"it moves at {seen.speed:.3g} m/s (allowed: {limits.speed_max:g})"
         if seen.tilt_degrees <= limits.tilt_max_degrees:
@@ -368,7 +371,3 @@ def _read_setpoint(setpoint: Setpoint | None) -> Vector | None:
 
 def _clip(value: float, low: float, high: float) -> float:
     return min(max(value, low), high)
-
-
-def _format_point(point: Vector) -> str:
-    return f"({', '.join(f'{value:.3g}' for value in point)})"

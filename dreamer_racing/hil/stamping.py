@@ -14,8 +14,7 @@ from dreamer_racing.hil.pose import Received
 from dreamer_racing.hil.safety_limits import SafetyLimits
 from dreamer_racing.hil.vehicle import Pose
 
-SILENCE = 0.5
-"""s without packets after which a sender may restart with lower numbers [choice]; motors are cut by then."""
+SILENCE = 0.5  # s without packets after which a sender may restart with lower numbers [choice]; motors are cut by then
 
 
 class Stamping(Enum):

@@ -24,12 +24,9 @@ import numpy as np
 from dreamer_racing.hil.vehicle import GRAVITY, Command
 from dreamer_racing.settings import ALLOWED, Range, check_settings
 
-LOWEST, CENTRE, HIGHEST = 1000.0, 1500.0, 2000.0
-"""Ends and centre of a channel, µs."""
+LOWEST, CENTRE, HIGHEST = 1000.0, 1500.0, 2000.0  # ends and centre of a channel, µs
 CHANNELS = 16
-FIRST_SWITCH = 4
-"""Index of AUX1, the first channel that is no stick."""
-
+FIRST_SWITCH = 4  # index of AUX1, the first channel that is no stick
 _RATE = Range(0, math.radians(2000), open_below=True)  # Betaflight's rc_rate ends at 200, in units of 10 deg/s
 _PHYSICAL = Range(0, 1e4, open_below=True)
 

@@ -12,8 +12,7 @@ from threading import Event, Lock, Thread
 
 from dreamer_racing.hil.vehicle import Command, Link, at_rest
 
-CHECKS = 10
-"""Checks per timeout [choice]: the thread acts at most a tenth of the timeout late."""
+CHECKS = 10  # checks per timeout [choice]: the thread acts at most a tenth of the timeout late
 
 
 class Watchdog:
@@ -65,15 +64,13 @@ class Watchdog:
         return self.acted
 
     def _watch(self) -> None:
+        """Send disarm frames if the loop is late, or ever was."""
         while not self._closed.wait(self._longest / CHECKS):
             with self._sending:
-                self._check_loop()
-
-    def _check_loop(self) -> None:
-        """Send a disarm frame if the loop is late, or ever was."""
-        if not self._is_late():
-            return
-        try:
-            self.error = None if self._link.send(at_rest()) else OSError("the link did not send the disarm frame")
-        except Exception as error:  # whatever failed, the next frame may get through
-            self.error = error
+                if not self._is_late():
+                    continue
+                try:
+                    sent = self._link.send(at_rest())
+                    self.error = None if sent else OSError("the link did not send the disarm frame")
+                except Exception as error:  # whatever failed, the next frame may get through
+                    self.error = error

@@ -32,6 +32,20 @@ def kernel_stamps() -> Iterator[None]:
         yield  # the inlet asks as long as the test runs
 
 
+class Clock:
+    """A clock that a test turns."""
+
+    now = 0.0
+
+    def __call__(self) -> float:
+        return self.now
+
+
+@pytest.fixture
+def clock() -> Clock:
+    return Clock()
+
+
 @pytest.fixture
 def wire() -> Iterator[tuple[int, str]]:
     """The far end of a serial line, and the path of the near one."""

@@ -19,7 +19,7 @@ from dreamer_racing.envs.tracks import load_track
 from dreamer_racing.export.contract import describe_rate_loop
 from dreamer_racing.export.onnx_actor import read_contract
 from dreamer_racing.hil.chain import ChainConfig, FlightChain, describe_outputs, read_inputs
-from dreamer_racing.hil.flyer import check_contract, check_flown_by_betaflight, check_ranges, check_rate_loop
+from dreamer_racing.hil.flyer import Flyer, check_contract, check_flown_by_betaflight, check_ranges, check_rate_loop
 from dreamer_racing.hil.recording import FILE, Flight, FlightRecorder
 from dreamer_racing.hil.safety_limits import SafetyLimits
 from dreamer_racing.hil.sticks import RateMap, ThrustMap, channels
@@ -237,7 +237,7 @@ def test_drones_that_are_none(changes, message):
 # Flights of flyers that need what the IMU tells: told, played back, and cut where it is told no longer.
 
 
-class Feeling:
+class Feeling(Flyer):
     """Damps by the gyro, so that every sample shows in what it wants."""
 
     rate, camera, needs_imu = 50.0, None, True
@@ -250,9 +250,6 @@ class Feeling:
         assert imu is not None
         self.told.append(imu)
         return Setpoint(GRAVITY + 0.5 - 0.01 * (imu[5] - GRAVITY), 0.3 - imu[:3])
-
-    def prepare(self) -> None:
-        pass
 
 
 def make(**limits: float) -> tuple[LockStep, FlightChain]:

@@ -32,18 +32,6 @@ from dreamer_racing.hil.stamping import Stamping
 from dreamer_racing.hil.view import PORT
 
 
-class Clock:
-    now = 0.0
-
-    def __call__(self) -> float:
-        return self.now
-
-
-@pytest.fixture
-def clock() -> Clock:
-    return Clock()
-
-
 @pytest.fixture
 def switch(clock):
     operator = UdpOperator(0, clock=clock)

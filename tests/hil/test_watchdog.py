@@ -39,23 +39,9 @@ class Wire:
         return b"frame"
 
 
-class Time:
-    """A clock that a test turns."""
-
-    now = 10.0
-
-    def __call__(self) -> float:
-        return self.now
-
-
 @pytest.fixture
 def wire():
     return Wire()
-
-
-@pytest.fixture
-def clock():
-    return Time()
 
 
 @pytest.fixture

@@ -5,9 +5,6 @@
 
 The first prints lines for the flight controller's CLI. The second reads the output of ``dump all`` or ``diff all``, and
 exits with status 1 if a setting differs or is missing, 2 if there is nothing to compare.
-
-`settings` has the required settings, `status` reads a flight controller's status, `command_line` types into its CLI,
-and `firmware` runs a Betaflight that was built for a computer (SITL).
 """
 
 from dreamer_racing.hil.betaflight.settings import (

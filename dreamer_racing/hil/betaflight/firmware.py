@@ -25,8 +25,7 @@ from dreamer_racing.hil.betaflight.command_line import CommandLine, connect
 
 logger = logging.getLogger(__name__)
 
-VARIABLE = "BETAFLIGHT_SITL"
-"""Environment variable that names a firmware's program."""
+VARIABLE = "BETAFLIGHT_SITL"  # environment variable that names a firmware's program
 
 BOOT = 6.0
 """s of simulated time that pass before the first state packet: the firmware does not arm within 5 s of its start."""
@@ -79,7 +78,7 @@ def find_firmware(named: str | Path | None = None) -> Path:
 
 
 class Firmware:
-    """A firmware that is set up, and runs from `start` to `stop`, or within a ``with`` block.
+    """A firmware that is set up, and runs from `start` to `stop`.
 
     Args:
         program: As returned by `find_firmware`.
@@ -128,15 +127,6 @@ class Firmware:
         """Stop it, and remove its folder; may be called twice."""
         self.stop()
         self._folder.cleanup()
-
-    def __enter__(self) -> Self:
-        """Start it."""
-        self.start()
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        """Stop it and remove its folder."""
-        self.close()
 
     def wait_for_serial(self) -> None:
         """Wait until it has booted enough for its serial port to be open.
