@@ -18,7 +18,7 @@ from dreamer_racing.hil.background_worker import BackgroundWorker
 from dreamer_racing.hil.battery import battery_words
 from dreamer_racing.hil.chain import FlightChain, Inputs, Outputs, describe_inputs, describe_outputs
 from dreamer_racing.hil.operator import Operator, OperatorSource
-from dreamer_racing.hil.pose import PoseSource
+from dreamer_racing.hil.pose import PoseSource, Received
 from dreamer_racing.hil.recording import FlightRecorder
 from dreamer_racing.hil.safety import Reason
 from dreamer_racing.hil.vehicle import Link, at_rest
@@ -225,7 +225,7 @@ class FlightLoop:
         heard = self._use("the link", self._link.listen, None)
         imu = self._link.read_imu() if self._chain.needs_imu else []
         refusal = self._link.refusal
-        poses = self._use("the source of poses", self._poses.poll, [])
+        poses: list[Received] = self._use("the source of poses", self._poses.poll, [])
         inputs = Inputs(start, poses, operator, overrun, heard or [], self._dropped, imu, refusal)
         outputs = self._chain.tick(inputs)
         if outputs.voltage is not None:
