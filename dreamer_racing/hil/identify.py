@@ -1,8 +1,4 @@
-"""The identification flight: small steps of body rates and thrust around a hover at the start.
-
-The flight is gentle: the vehicle never tilts by more than about half a radian, and returns to its place after each
-step. Its recording is for `dreamer_racing.identification`.
-"""
+"""The flight for `dreamer_racing.identification`: small steps of body rates and thrust around a hover at the start."""
 
 from __future__ import annotations
 

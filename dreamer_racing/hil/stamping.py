@@ -1,8 +1,4 @@
-"""Estimates when a pose was measured, by the loop's clock, and extrapolates it to the present.
-
-A motion-capture system stamps poses with its own clock, and the network delays them by varying times. It is known when
-a packet arrived, but not when its pose was measured.
-"""
+"""Estimates when a pose was measured, by the loop's clock, and extrapolates it to now; see docs/hil_wiring.md."""
 
 from __future__ import annotations
 

