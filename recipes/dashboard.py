@@ -28,8 +28,7 @@ from dreamer_racing.export.agents import existing_agent_path
 from dreamer_racing.export.shipped_agent import is_agent
 from dreamer_racing.figures.dashboard import serve, write_page
 from dreamer_racing.figures.dashboard_panel import ShownFlight, how_it_trained, missing
-from dreamer_racing.figures.evaluations import STORED, stored_flights
-from dreamer_racing.figures.plotting import run_of, stage_name
+from dreamer_racing.figures.plotting import STORED, run_of, stage_name, stored_flights
 from dreamer_racing.figures.scene_3d import check_viser
 from dreamer_racing.settings import SEED, Range, setting
 

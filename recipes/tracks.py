@@ -44,7 +44,7 @@ def main(config: TracksConfig) -> None:
     found = [measures(track) for track in tracks]
     print(json.dumps(found, indent=1) if config.json else "\n".join(table(found)))
     if config.picture is not None:
-        from dreamer_racing.figures.top_down import plot_tracks  # importing it takes far longer than the list
+        from dreamer_racing.figures.flights import plot_tracks  # importing it takes far longer than the list
 
         with plain_errors():
             plot_tracks(tracks, config.picture)

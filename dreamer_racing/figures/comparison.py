@@ -1,12 +1,9 @@
-"""Comparison of an experiment's variants: results aggregated over seeds, as numbers and as a table.
-
-Shapes: S seeds of a variant.
-"""
+"""Comparison of an experiment's variants: results aggregated over S seeds each, as numbers and as a table."""
 
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -25,18 +22,15 @@ class VariantResult:
     """Results of the runs of one variant."""
 
     key: CurveKey
-    seeds: int
-    """S, number of runs that reach the window."""
+    seeds: int  # S, number of runs that reach the window
     values: dict[str, np.ndarray]
     """Each run's mean over the window, by name in `COMPARED`, if any has logged it: (S,), or fewer without a value."""
-    window: tuple[float, float]
-    """Start and end on the axis, common to all variants of the algorithm on the track."""
-    wall_clock: float | None
-    """Mean duration of these runs, s; None if no run recorded it."""
+    window: tuple[float, float]  # on the axis, common to all variants of the algorithm on the track
+    wall_clock: float | None  # mean duration of these runs, s; None if no run recorded it
 
     @property
     def name(self) -> str:
-        """Display name of the variant; underscores become spaces, except in settings."""
+        """Display name, with spaces for underscores except in settings."""
         name = self.key.variant or REFERENCE
         return name if "=" in name else name.replace("_", " ")
 
@@ -46,10 +40,8 @@ class Comparison:
     """Content of a table or figure of variants."""
 
     results: list[VariantResult]
-    problems: list[str]
-    """A line for everything left out."""
-    axis: str = "env_steps"
-    """Axis along which runs were compared, one of `AXES`."""
+    problems: list[str]  # a line for everything left out
+    axis: str = "env_steps"  # one of `AXES`
 
     @property
     def caption(self) -> str:
@@ -65,8 +57,7 @@ def compare_variants(runs: Sequence[RunData], problems: Sequence[str] = (), axis
     """Average runs over a final window and the seeds of each variant, sorted with the reference first, then by name.
 
     The window is the same for all variants of an algorithm on a track. It ends at the env_steps of the longest run, or
-    on a time axis at the time that every variant has reached, so that no variant has more time than another. Add
-    ``problems``, lines for what was left out before.
+    on a time axis at the time that every variant has reached, so that no variant has more time than another.
 
     Raises:
         ValueError: there are no runs, or two runs of one variant have the same seed.
@@ -78,12 +69,24 @@ def compare_variants(runs: Sequence[RunData], problems: Sequence[str] = (), axis
     ends: dict[tuple[str, str], list[float]] = defaultdict(list)  # of the longest run of each variant
     for key, group in groups.items():
         ends[key[:2]].append(max(map(_end, group)))
-    found = [*problems, *without_clock, *_short_windows(ends, axis)]
+    form, timed = axis_of(axis).form, axis_of(axis).clock is not None
+    found = [*problems, *without_clock]
+    found += [
+        f"{algorithm} {track}: compared up to {min(last):{form}} {axis}, where the shortest variant ends, "
+        f"of {max(last):{form}}"
+        for (track, algorithm), last in ends.items()
+        if timed and min(last) < ENDS_EARLY * max(last)
+    ]
     results = []
     for key, group in groups.items():
-        last = min(ends[key[:2]]) if axis_of(axis).clock else max(ends[key[:2]])
+        last = min(ends[key[:2]]) if timed else max(ends[key[:2]])
         first = (1 - LAST_SHARE) * last
-        found += [_ends_early(run, first, last, axis) for run in group if _end(run) < ENDS_EARLY * last]
+        found += [
+            f"{run.name} ends at {_end(run):{form}} {axis}, but {first:{form}} to {last:{form}} are compared: "
+            + ("left out" if _end(run) < first else "used up to its end")
+            for run in group
+            if _end(run) < ENDS_EARLY * last
+        ]
         results.append(_result(key, [run for run in group if _end(run) >= first], (first, last)))
     order = sorted(results, key=lambda result: (result.key[:2], not result.key.is_reference, result.key))
     return Comparison(order, found, axis)
@@ -91,25 +94,6 @@ def compare_variants(runs: Sequence[RunData], problems: Sequence[str] = (), axis
 
 def _end(run: RunData) -> float:
     return float(run.metrics.env_steps.max(initial=0.0))
-
-
-def _short_windows(ends: Mapping[tuple[str, str], Sequence[float]], axis: str) -> list[str]:
-    """Return a note for each comparison on a time axis whose window ends long before the longest variant."""
-    if not axis_of(axis).clock:
-        return []
-    form = axis_of(axis).form
-    return [
-        f"{algorithm} {track}: compared up to {min(last):{form}} {axis}, where the shortest variant ends, "
-        f"of {max(last):{form}}"
-        for (track, algorithm), last in ends.items()
-        if min(last) < ENDS_EARLY * max(last)
-    ]
-
-
-def _ends_early(run: RunData, first: float, last: float, axis: str) -> str:
-    form = axis_of(axis).form
-    what = "left out" if _end(run) < first else "used up to its end"
-    return f"{run.name} ends at {_end(run):{form}} {axis}, but {first:{form}} to {last:{form}} are compared: {what}"
 
 
 def _result(key: CurveKey, group: Sequence[RunData], window: tuple[float, float]) -> VariantResult:

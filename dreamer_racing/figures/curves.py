@@ -32,14 +32,10 @@ class Quantity:
     """A quantity that can be drawn as a learning curve."""
 
     label: str
-    column: str
-    """Column of `metrics.csv`."""
-    comparable: bool = False
-    """Whether it is a rate from 0 to 1, which is comparable across tracks, so that tracks may be pooled."""
-    counted: bool = False
-    """Whether it is a count, so that bars and axes begin at 0."""
-    positive: bool = False
-    """Whether it is never negative, so that its axis does not go below 0."""
+    column: str  # of `metrics.csv`
+    comparable: bool = False  # a rate from 0 to 1, which is comparable across tracks, so that tracks may be pooled
+    counted: bool = False  # a count, so that bars and axes begin at 0
+    positive: bool = False  # never negative, so that its axis does not go below 0
 
 
 QUANTITIES = {
@@ -69,14 +65,11 @@ class Curve:
 
     key: CurveKey
     quantity: str
-    x: np.ndarray
-    """Positions on the figure's axis."""
+    x: np.ndarray  # positions on the figure's axis
     centre: np.ndarray
-    low: np.ndarray
-    """NaN, as is `high`, where there is a single seed."""
+    low: np.ndarray  # NaN, as is `high`, where there is a single seed
     high: np.ndarray
-    seeds: np.ndarray
-    """int: number of runs with a value."""
+    seeds: np.ndarray  # int: number of runs with a value
 
 
 @dataclass(frozen=True)
@@ -84,23 +77,15 @@ class LearningCurves:
     """Content of a figure of learning curves."""
 
     curves: list[Curve]
-    raises: dict[CurveKey, np.ndarray]
-    """Positions on the axis where the curriculum raised b₂, for all seeds together."""
+    raises: dict[CurveKey, np.ndarray]  # positions on the axis where the curriculum raised b₂, of all seeds together
     aggregate: str
-    window: float
-    """Window of the running mean, in units of the axis."""
-    problems: list[str]
-    """A line for everything left out."""
-    axis: str = "env_steps"
-    """One of `AXES`."""
+    window: float  # of the running mean, in units of the axis
+    problems: list[str]  # a line for everything left out
+    axis: str = "env_steps"  # one of `AXES`
 
 
 def wanted_columns(quantities: Sequence[str], axis: str = "env_steps") -> list[str]:
-    """Return the columns of `metrics.csv` that are needed to draw quantities along an axis.
-
-    Raises:
-        ValueError: a quantity or the axis is unknown.
-    """
+    """Return the columns of `metrics.csv` to draw quantities along an axis; raise ValueError if one is unknown."""
     clock = axis_of(axis).clock
     for name in quantities:
         check_choice("quantities", name, QUANTITIES)
@@ -110,7 +95,7 @@ def wanted_columns(quantities: Sequence[str], axis: str = "env_steps") -> list[s
 
 
 def _evaluation_markers(column: str) -> list[str]:
-    """Return the columns that mark the rows of evaluations, if the column is of evaluations; else none."""
+    """Return the columns that mark the rows of evaluations, for a column of evaluations."""
     prefix = column.partition("/")[0]
     return [f"{prefix}/{name}" for name in PRESENCE] if prefix.startswith("evaluation") else []
 
@@ -123,21 +108,15 @@ def learning_curves(
     problems: Sequence[str] = (),
     axis: str = "env_steps",
 ) -> LearningCurves:
-    """Aggregate runs over seeds on a common axis.
+    """Aggregate runs of any algorithms and tracks over seeds, for `QUANTITIES` on a common axis, one of `AXES`.
 
-    Args:
-        runs: runs of any algorithms and tracks.
-        quantities: names in `QUANTITIES`.
-        aggregate: ``mean`` (with the sample standard deviation) or ``iqm`` (interquartile mean with a 95 % interval).
-        window: window of the running mean, in units of the axis; None for 2 % of the longest run.
-        problems: lines for what was left out before.
-        axis: one of `AXES`.
+    The aggregate is ``mean`` (with the sample standard deviation) or ``iqm`` (interquartile mean with a 95 % interval),
+    of running means over a window, in units of the axis, by default 2 % of the longest run.
 
     Raises:
         ValueError: there are no runs or values, a name is unknown, or two runs of one curve have the same seed.
     """
     wanted_columns(quantities, axis)
-    check_choice("aggregate", aggregate, AGGREGATES)
     if not runs:
         raise ValueError(f"there is no run to draw. {'; '.join(problems) or 'None was given.'}")
     runs, without_clock = along(runs, axis)
@@ -172,10 +151,8 @@ def learning_curves(
 class Sampled(NamedTuple):
     """The runs of one curve on the common axis, (S, P) each."""
 
-    values: np.ndarray
-    """NaN where a run has no value."""
-    reached: np.ndarray
-    """bool: whether the point is within the measured range of the run, even without a value."""
+    values: np.ndarray  # NaN where a run has no value
+    reached: np.ndarray  # bool: whether the point is within the measured range of the run, even without a value
 
     @property
     def has_gaps(self) -> bool:
@@ -251,17 +228,12 @@ def interquartile_mean(scores: np.ndarray) -> np.ndarray:
 def bootstrap_interval(
     strata: Sequence[np.ndarray], statistic: Callable[[np.ndarray], np.ndarray] = interquartile_mean
 ) -> np.ndarray:
-    """Return a stratified percentile-bootstrap interval of a statistic; every track keeps its number of runs.
+    """Return the 2.5 and the 97.5 percentile (2, P) of a statistic along the first axis, by D draws of a bootstrap.
+
+    It is stratified: every track keeps its number of runs (S, P).
 
     Reference: Agarwal et al., 2021, whose library rliable is not used: it needs arch, pandas and seaborn, and its
     stratified bootstrap draws from numpy's global generator.
-
-    Args:
-        strata: the runs of each track, (S, P).
-        statistic: function of an array (S, ...) along its first axis.
-
-    Returns:
-        (2, P): the 2.5 and the 97.5 percentile of D draws.
     """
     generator = np.random.default_rng(0)
     pooled = [stratum[generator.integers(len(stratum), size=(len(stratum), DRAWS))] for stratum in strata]
@@ -281,7 +253,7 @@ AGGREGATES: dict[str, tuple[Callable[..., np.ndarray], Callable[..., np.ndarray]
 
 
 def _aggregate(key: CurveKey, quantity: str, grid: np.ndarray, strata: list[Sampled], aggregate: str) -> Curve:
-    """Aggregate strata of runs at every point where at least half of the runs in range have a value."""
+    """Aggregate runs, by track, at every point where at least half of the runs in range have a value."""
     present = np.isfinite(np.concatenate([stratum.values for stratum in strata]))  # (S, P)
     reached = np.concatenate([stratum.reached for stratum in strata])  # (S, P)
     shown = present & (2 * present.sum(0) >= (present | reached).sum(0))
@@ -326,10 +298,7 @@ _RAISE = "b2_raised"  # in the column quantity, for rows without values
 
 
 def write_curves(path: str | Path, curves: LearningCurves) -> None:
-    """Write curves as one CSV file, one row per point, after header lines with `#` that hold the settings.
-
-    Columns: `quantity`, `track`, `algorithm`, `variant`, one named as the axis, `centre`, `low`, `high`, `seeds`.
-    """
+    """Write curves as one CSV file, one row per point, after header lines with `#` that hold the settings."""
     form = ".6g" if axis_of(curves.axis).clock else ".0f"
     Path(path).parent.mkdir(parents=True, exist_ok=True)
     with Path(path).open("w", newline="", encoding="utf-8") as file:
@@ -355,11 +324,7 @@ def curves_file(path: str | Path) -> Path | None:
 
 
 def read_curves(path: str | Path) -> LearningCurves:
-    """Read a file written by `write_curves`.
-
-    Raises:
-        ValueError: the file is of another kind.
-    """
+    """Read a file written by `write_curves`; raise ValueError if it is of another kind."""
     with Path(path).open(newline="", encoding="utf-8") as file:
         lines = file.readlines()
     notes = [line[2:].rstrip("\n").partition(": ") for line in lines if line.startswith("# ")]

@@ -2,7 +2,6 @@
 
 A page in a file combines viser's recording of a `RaceScene`, which includes the viewer, with a panel whose images,
 numbers and cursor follow the time of viser's scrubber. A live page shows the same from a viser server.
-Shapes: K control steps of an episode; F flights, one or two.
 """
 
 from __future__ import annotations
@@ -37,8 +36,7 @@ from dreamer_racing.training.directory import replace_text
 if TYPE_CHECKING:
     import viser
 
-LOOPBACK = "127.0.0.1"
-"""Servers listen on the loopback interface only."""
+LOOPBACK = "127.0.0.1"  # servers listen on this interface only
 KEYS = "Space: play or pause. Comma or full stop: one step back or forward. Click on a curve: go to that time."
 HOLD = 1.0  # s that the last frame is held before the recording repeats
 FRAME = 0.04  # s between frames of a live page
@@ -52,13 +50,9 @@ IN_VISER = """
 
 
 def write_page(path: str | Path, track: Track, flights: Sequence[ShownFlight], training: Sequence[str] = ()) -> int:
-    """Write the page of flights in one scene; return its size in bytes.
+    """Write the page of one or two flights on a track; return its size in bytes.
 
-    Args:
-        path: the file; missing folders are created.
-        track: the track of all flights.
-        flights: one or two flights.
-        training: lines that say how to see the flights' training curves, with commands between backquotes.
+    Lines of ``training`` say how to see the flights' training curves, with commands between backquotes.
 
     Raises:
         ValueError: viser is not installed.
@@ -99,11 +93,7 @@ def quiet_server(port: int) -> Iterator[viser.ViserServer]:
 
 
 def compose(viewer: str, track: Track, flights: Sequence[ShownFlight], training: Sequence[str]) -> str:
-    """Insert the panel into viser's page.
-
-    Raises:
-        RuntimeError: the page's HTML differs from that of the expected viser version.
-    """
+    """Insert the panel into viser's page; raise RuntimeError if its HTML is not that of the expected version."""
     names = " against ".join(flight.title for flight in flights)
     title, end = "<title>Viser</title>", "</body>"
     if viewer.count(title) != 1 or end not in viewer:
@@ -134,15 +124,9 @@ def serve(
     announce: Callable[[str], None] = lambda address: None,
     goes_on: Callable[[], bool] = lambda: True,
 ) -> None:
-    """Serve a live page of flights to browsers on this machine, until ``goes_on``, asked each frame, returns False.
+    """Serve a live page of one or two flights to browsers on this machine, until ``goes_on`` returns False.
 
-    Args:
-        track: the track of all flights.
-        flights: one or two flights.
-        port: the port; if taken, the next free one.
-        training: as in `write_page`.
-        announce: called with the address once the page is ready.
-        goes_on: whether to continue.
+    The port is the next free one if it is taken; ``announce`` is called with the address once the page is ready.
 
     Raises:
         ValueError: viser is not installed.

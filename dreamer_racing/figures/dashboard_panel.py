@@ -1,7 +1,6 @@
-"""The panel of a flight's page as HTML: legend, on-board images, state, and curves beside the 3-D scene.
+"""The panel of a flight's page as static HTML: the page's script or server sets cursor, images and numbers.
 
-The panel is static: the page's script or server sets cursor position, images and numbers.
-Shapes: K control steps of an episode; F flights, one or two.
+Shapes: K control steps of an episode.
 """
 
 from __future__ import annotations
@@ -26,7 +25,7 @@ from dreamer_racing.envs.drone.parameters import QuadrotorParameters
 from dreamer_racing.envs.tracks import Track
 from dreamer_racing.evaluation.trajectory import Trajectory
 from dreamer_racing.figures.drawing import speed_scale
-from dreamer_racing.figures.hud import laps_completed
+from dreamer_racing.figures.film import laps_completed
 from dreamer_racing.figures.scene_3d import DRONE_SCALE, Paint, paints
 
 SHEET_COLUMNS = 25  # images per row of the sheet with all images of a flight
@@ -34,7 +33,6 @@ CURVE_WIDTH, CURVE_HEIGHT = 1000.0, 100.0  # in a curve's SVG coordinates
 HEADROOM = 0.06  # space above and below a curve, as a share of its range
 COLOR_STOPS = 8  # number of colours in a legend's gradient
 STYLE = "dashboard.css"  # in this module's folder
-LARGER = f"Drones are drawn {DRONE_SCALE:g} times their size."
 
 
 class ShownFlight(NamedTuple):
@@ -77,7 +75,8 @@ def panel(track: Track, flights: Sequence[ShownFlight], training: Sequence[str])
     """Return the HTML of the panel: legend, images, state, curves, notes."""
     colors = paints(len(flights))
     shown = list(zip(flights, colors, strict=True))
-    lines = [*training, *(line for flight in flights for line in missing(flight)), LARGER]
+    lines = [*training, *(line for flight in flights for line in missing(flight))]
+    lines.append(f"Drones are drawn {DRONE_SCALE:g} times their size.")
     parts = (
         f"<header><h1>{escape(track.name)}</h1>{_legend(shown)}</header>",
         f'<section class="views">{_views(shown)}{_state(track, shown)}</section>',
@@ -117,7 +116,7 @@ def readings(track: Track, flights: Sequence[ShownFlight]) -> dict[str, Any]:
                 "control_dt": flight.trajectory.control_dt,
                 "words": state_words(track, flight.trajectory),
                 "values": {
-                    trace.name: [_number(value) for value in values.tolist()]
+                    trace.name: [round(value, 3) if math.isfinite(value) else None for value in values.tolist()]
                     for trace in TRACES
                     if (values := trace.values(flight.trajectory)) is not None
                 },
@@ -130,10 +129,8 @@ def readings(track: Track, flights: Sequence[ShownFlight]) -> dict[str, Any]:
 def state_words(track: Track, flight: Trajectory) -> list[list[str]]:
     """Return lap, next gate and status at each of the K + 1 rows of a flight."""
     laps = np.minimum(laps_completed(flight) + 1, track.laps).tolist()
-    gates = (flight.target_gate + 1).tolist()
-    words = [
-        [f"{lap}/{track.laps}", f"{gate}/{track.num_gates}", "flying"] for lap, gate in zip(laps, gates, strict=True)
-    ]
+    rows = zip(laps, (flight.target_gate + 1).tolist(), strict=True)
+    words = [[f"{lap}/{track.laps}", f"{gate}/{track.num_gates}", "flying"] for lap, gate in rows]
     words[-1][2] = flight.ending
     return words
 
@@ -151,7 +148,7 @@ def image_sheet(pixels: np.ndarray) -> str:
 
 
 def _legend(shown: Sequence[tuple[ShownFlight, Paint]]) -> str:
-    """Return the HTML of the legend: each flight's colour, result, and colour scale of speeds."""
+    """Return each flight's colour, result, and colour scale of speeds."""
     top = speed_scale([flight.trajectory for flight, _ in shown]).vmax
     rows = []
     for flight, paint in shown:
@@ -173,7 +170,7 @@ def _result(flight: Trajectory) -> str:
 
 
 def _views(shown: Sequence[tuple[ShownFlight, Paint]]) -> str:
-    """Return the HTML of the on-board images, or a note for a flight without images."""
+    """Return the on-board images, or a note for a flight without images."""
     views = []
     for index, (flight, paint) in enumerate(shown):
         if (pixels := flight.trajectory.pixels) is None:
@@ -202,7 +199,7 @@ def _state(track: Track, shown: Sequence[tuple[ShownFlight, Paint]]) -> str:
 
 
 def _curves(shown: Sequence[tuple[ShownFlight, Paint]]) -> Iterator[str]:
-    """Yield the HTML of the curves of each trace that at least one flight has, and of their time axis."""
+    """Yield the curves of each trace that at least one flight has, and their time axis."""
     longest = duration([flight.trajectory for flight, _ in shown])
     passes = "".join(_passes(flight.trajectory, paint, longest) for flight, paint in shown)
     for trace in TRACES:
@@ -232,7 +229,7 @@ def _curves(shown: Sequence[tuple[ShownFlight, Paint]]) -> Iterator[str]:
 
 
 def _zero(low: float, high: float) -> str:
-    """Return an SVG line at zero if zero is within a curve's range, else an empty string."""
+    """Return an SVG line at zero if it is within a curve's range."""
     level = CURVE_HEIGHT * high / (high - low)
     inside = low < 0.0 < high
     return f'<line class="zero" x2="{CURVE_WIDTH:g}" y1="{level:.1f}" y2="{level:.1f}"/>' if inside else ""
@@ -264,10 +261,6 @@ def _with_code_elements(line: str) -> str:
     """Convert text between backquotes to HTML code elements."""
     parts = escape(line).split("`")
     return "".join(f"<code>{part}</code>" if index % 2 else part for index, part in enumerate(parts))
-
-
-def _number(value: float) -> float | None:
-    return round(value, 3) if math.isfinite(value) else None
 
 
 def duration(flights: Sequence[Trajectory]) -> float:

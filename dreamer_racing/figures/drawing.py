@@ -1,8 +1,4 @@
-"""Drawing of races, as PNG, PDF or SVG by the path's suffix.
-
-Each figure is a separate `matplotlib.figure.Figure`; pyplot and its global state are not used.
-Shapes: K control steps of an episode.
-"""
+"""Drawing of races of K control steps, as PNG, PDF or SVG by the path's suffix, without pyplot's global state."""
 
 from __future__ import annotations
 
@@ -56,9 +52,19 @@ def speed_scale(trajectories: Sequence[Trajectory]) -> Normalize:
 
 def draw_flight(axes: Axes, trajectory: Trajectory, speed: Normalize, plane: tuple[int, int] = (0, 1)) -> None:
     """Draw a path coloured by speed in the plane of two world axes, the camera's directions, start, and any crash."""
-    _draw_path(axes, trajectory, plane, speed)
-    _draw_cameras(axes, trajectory, plane)
-    _draw_ends(axes, trajectory, plane)
+    points = trajectory.position[:, list(plane)].numpy()  # (K + 1, 2)
+    segments = np.stack((points[:-1], points[1:]), axis=1)  # (K, 2, 2)
+    lines = LineCollection(list(segments), cmap=SPEED_COLORS, norm=speed, linewidth=2.8, capstyle="round", zorder=5)
+    lines.set_array(trajectory.speed[1:].numpy())
+    axes.add_collection(lines, autolim=False)
+    every = max(1, round(ARROW_INTERVAL / trajectory.control_dt))
+    direction = camera_directions(trajectory.attitude[::every], trajectory.camera_tilt)[:, list(plane)].numpy()
+    arrow: Style = {"width": 0.010, "headwidth": 4.5, "headlength": 5.0, "headaxislength": 4.5, "color": INK}
+    scale: Style = {"angles": "xy", "scale_units": "xy", "scale": 1.0, "units": "inches"}
+    axes.quiver(*points[::every].T, *(ARROW_LENGTH * direction).T, **scale, **arrow, alpha=0.7, zorder=6)
+    axes.plot(*points[0], **START, zorder=4.5)
+    if trajectory.crashed:
+        axes.plot(*points[-1], **CRASH, zorder=4.6)
 
 
 def draw_speed_scale(figure: Figure, panels: Sequence[Axes], speed: Normalize, label: str = "speed (m/s)") -> None:
@@ -86,21 +92,17 @@ def draw_track(axes: Axes, track: Track, labels: bool = True) -> None:
 
 
 def save(figure: Figure, path: str | Path, left_out: Sequence[str] = ()) -> None:
-    """Write a figure into a folder that may not exist yet, and what was left out of it into `left_out_of(path)`.
+    """Write a figure into a folder that may not exist yet, and what was left out of it beside it, `*_left_out.txt`.
 
     If nothing was left out, such a file of an earlier figure is removed.
     """
     Path(path).parent.mkdir(parents=True, exist_ok=True)
     figure.savefig(path, dpi=150, facecolor="white")
+    beside = Path(path).with_name(f"{Path(path).stem}_left_out.txt")
     if left_out:
-        left_out_of(path).write_text("".join(f"{line}\n" for line in left_out), encoding="utf-8")
+        beside.write_text("".join(f"{line}\n" for line in left_out), encoding="utf-8")
     else:
-        left_out_of(path).unlink(missing_ok=True)
-
-
-def left_out_of(path: str | Path) -> Path:
-    """Return the path of the text file that names what was left out of the figure ``path``."""
-    return Path(path).with_name(f"{Path(path).stem}_left_out.txt")
+        beside.unlink(missing_ok=True)
 
 
 def dress(axes: Axes, grid: Literal["both", "x", "y"] = "both") -> None:
@@ -112,26 +114,16 @@ def dress(axes: Axes, grid: Literal["both", "x", "y"] = "both") -> None:
 
 
 def from_zero(axes: Axes, least: float = 1.0) -> None:
-    """Set the vertical axis of a non-negative quantity to begin at 0 and end at ``least`` or above.
-
-    By default, matplotlib centres the axis on 0 if all values are 0.
-    """
+    """Begin the vertical axis at 0, on which matplotlib would centre it if all values are 0, and end it above."""
     axes.set_ylim(0.0, max(least, axes.get_ylim()[1]))
 
 
-def tilt_of(trajectory: Trajectory) -> float:
-    """Return the tilt of a flight's camera, degrees, or the default camera's if it is unknown."""
-    return Camera.tilt if trajectory.camera_tilt is None else trajectory.camera_tilt
+def camera_directions(attitude: torch.Tensor, tilt: float | None) -> torch.Tensor:
+    """Return unit vectors (..., 3) of the nose camera in the world, of attitudes (..., 4) wxyz, body → world.
 
-
-def camera_directions(attitude: torch.Tensor, tilt: float = Camera.tilt) -> torch.Tensor:
-    """Return the directions of the nose camera, (..., 3) unit vectors in the world.
-
-    Args:
-        attitude: (..., 4) unit quaternions wxyz, body → world.
-        tilt: tilt of the camera upwards from the body's x axis, degrees.
+    The tilt upwards from the body's x axis is in degrees; None for the default camera's.
     """
-    angle = math.radians(tilt)
+    angle = math.radians(Camera.tilt if tilt is None else tilt)
     axis = torch.tensor((math.cos(angle), 0.0, math.sin(angle)), dtype=attitude.dtype)
     return rotate(attitude, axis.expand(*attitude.shape[:-1], 3))
 
@@ -147,10 +139,7 @@ def dress_map(axes: Axes, y_label: str | None) -> None:
 
 
 def _draw_gate(axes: Axes, gate: Gate, width: float, color: str) -> None:
-    """Draw a gate from above: a bar as wide as the frame, with arrows in the direction of flight at its ends.
-
-    In the middle, the path would cover the arrows.
-    """
+    """Draw a bar as wide as the frame, with arrows forwards at its ends, because the path would cover the middle."""
     centre, left, forward = (np.array(vector[:2]) for vector in (gate.position, gate.left, gate.forward))
     ends = np.stack((centre - left * width / 2, centre + left * width / 2))  # (2, 2)
     axes.plot(*ends.T, color=color, linewidth=4.5, solid_capstyle="butt", zorder=4)
@@ -171,31 +160,6 @@ def _number_gate(axes: Axes, track: Track, number: int) -> None:
     side = -outwards if above else outwards  # stacked gates have their numbers at opposite ends
     place = centre + side * left * (track.shape.outer / 2 + 0.45)
     axes.text(place[0], place[1], str(number), ha="center", va="center", fontsize=9, color=INK, bbox=BADGE, zorder=7)
-
-
-def _draw_path(axes: Axes, trajectory: Trajectory, plane: tuple[int, int], speed: Normalize) -> None:
-    points = trajectory.position[:, list(plane)].numpy()  # (K + 1, 2)
-    segments = np.stack((points[:-1], points[1:]), axis=1)  # (K, 2, 2)
-    lines = LineCollection(list(segments), cmap=SPEED_COLORS, norm=speed, linewidth=2.8, capstyle="round", zorder=5)
-    lines.set_array(trajectory.speed[1:].numpy())
-    axes.add_collection(lines, autolim=False)
-
-
-def _draw_cameras(axes: Axes, trajectory: Trajectory, plane: tuple[int, int]) -> None:
-    """Draw the camera's direction, projected onto the plane, every 0.1 s."""
-    every = max(1, round(ARROW_INTERVAL / trajectory.control_dt))
-    origin = trajectory.position[::every, list(plane)].numpy()  # (M, 2)
-    direction = camera_directions(trajectory.attitude[::every], tilt_of(trajectory))[:, list(plane)].numpy()
-    arrow: Style = {"width": 0.010, "headwidth": 4.5, "headlength": 5.0, "headaxislength": 4.5, "color": INK}
-    scale: Style = {"angles": "xy", "scale_units": "xy", "scale": 1.0, "units": "inches"}
-    axes.quiver(*origin.T, *(ARROW_LENGTH * direction).T, **scale, **arrow, alpha=0.7, zorder=6)
-
-
-def _draw_ends(axes: Axes, trajectory: Trajectory, plane: tuple[int, int]) -> None:
-    start, end = trajectory.position[0, list(plane)].tolist(), trajectory.position[-1, list(plane)].tolist()
-    axes.plot(*start, **START, zorder=4.5)
-    if trajectory.crashed:
-        axes.plot(*end, **CRASH, zorder=4.6)
 
 
 def flight_legend(decoys: bool, crash: bool) -> list[Line2D]:

@@ -1,7 +1,4 @@
-"""Videos and GIFs of flights and of a world model's predictions.
-
-Shapes: T frames of H × W pixels, RGB, uint8.
-"""
+"""Videos and GIFs of flights and of a world model's predictions, and their captions, (T, H, W, 3) uint8 frames."""
 
 from __future__ import annotations
 
@@ -10,20 +7,20 @@ import math
 from collections.abc import Sequence
 from functools import cache
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import torch
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
-from PIL import Image, ImageDraw
+from PIL import Image, ImageDraw, ImageFont
 
 from dreamer_racing.envs.tracks import Track
 from dreamer_racing.evaluation.dreams import Dream
 from dreamer_racing.evaluation.trajectory import Trajectory, swapped_in
-from dreamer_racing.figures.drawing import CRASH_COLOR, INK, SPEED_COLORS, camera_directions, draw_track, tilt_of
+from dreamer_racing.figures.drawing import CRASH_COLOR, INK, SPEED_COLORS, camera_directions, draw_track
 
-VIDEO_HEIGHT = 256  # minimum height of a video in pixels, unless its scale is given
+VIDEO_HEIGHT = 256  # pixels
 CONTEXT_COLOR = (64, 160, 80)  # the model observes the images
 OPEN_LOOP_COLOR = (230, 120, 20)  # the model predicts the images from actions alone
 WHITE = (255, 255, 255)
@@ -33,16 +30,21 @@ MAP_MARGIN = 1.6  # m around the gates of a moving map
 MAP_TAIL = 1.0  # s of the path that a moving map shows
 GIF_SIZE = 256  # pixels, least side of either picture of a GIF
 MIN_DELAY = 0.02  # s; browsers show shorter GIF frames much longer
+SHORTEST_FILM = 4.0  # s; shorter flights are shown in slow motion, so that a viewer can follow them
+SLOWEST = 8  # maximum factor of slow motion
+STRIP_COLOR = (33, 37, 41)
+LETTER_SIZES = range(16, 6, -1)  # pixels
+MARGIN = 5  # pixels left and right of the caption
+BEGINNING = 300  # control steps shown if there is no second lap
+SEEN = "seen"
 
 logger = logging.getLogger(__name__)
 
 
-def write_video(path: str | Path, frames: np.ndarray | torch.Tensor, fps: float = 50, scale: int | None = None) -> bool:
-    """Write an H.264 (yuv420p) mp4 file, which most players support; without ffmpeg, write nothing and warn once.
+def write_video(path: str | Path, frames: np.ndarray | torch.Tensor, fps: float = 50) -> bool:
+    """Write an H.264 (yuv420p) mp4 file, which most players support; return whether there was an ffmpeg to do it.
 
-    Frames are (T, H, W, 3) uint8. Their pixels are enlarged by an integer factor without blurring, None for the
-    smallest one that makes the video at least 256 pixels high. Odd sizes then grow by one pixel, because H.264 needs
-    even ones. Returns whether the file was written.
+    Odd sizes grow by one pixel, because H.264 needs even ones.
 
     Raises:
         ValueError: the frames have another shape or type, or there are none.
@@ -52,13 +54,12 @@ def write_video(path: str | Path, frames: np.ndarray | torch.Tensor, fps: float 
         return False
     import imageio.v2 as imageio  # slow to import
 
-    scale = math.ceil(VIDEO_HEIGHT / array.shape[1]) if scale is None else scale
     looks: Any = {"codec": "libx264", "pixelformat": "yuv420p", "quality": 8, "macro_block_size": 1}
     with swapped_in(path) as partial:
         writer: Any = imageio.get_writer(partial, format="FFMPEG", fps=fps, **looks)
         with writer:
             for frame in array:
-                writer.append_data(_make_even(enlarge(frame, scale)))
+                writer.append_data(_make_even(frame))
     return True
 
 
@@ -78,52 +79,31 @@ def _finds_ffmpeg() -> bool:
 def write_gif(path: str | Path, frames: np.ndarray | torch.Tensor, fps: float = 25, colors: int = 64) -> int:
     """Write a small GIF with one palette for all frames and no dithering, so that unchanged pixels take no space.
 
-    Frames are (T, H, W, 3) uint8, 50 a second at most; the delay is rounded to the format's unit of 1/100 s. The
-    palette may have 2 to 256 colours. Returns the size of the file in bytes.
+    There are at most 50 frames a second; the delay is rounded to the format's unit of 1/100 s. The palette may have 2
+    to 256 colours. Returns the size of the file in bytes.
 
     Raises:
         ValueError: the frames have another shape or type, or there are none.
     """
     array = _as_frames(frames, "frames")
-    palette = _shared_palette(array, colors)
+    few = array[np.linspace(0, len(array) - 1, min(16, len(array))).round().astype(int)]
+    palette = Image.fromarray(few.reshape(-1, *few.shape[2:])).quantize(colors, method=Image.Quantize.MEDIANCUT)
     images = [Image.fromarray(frame).quantize(palette=palette, dither=Image.Dither.NONE) for frame in array]
     delay = round(max(MIN_DELAY, 1 / fps), 2)
+    animated: Any = {"save_all": True, "duration": round(1000 * delay), "optimize": False, "disposal": 1, "loop": 0}
     with swapped_in(path) as partial:
-        images[0].save(
-            partial,
-            format="GIF",
-            save_all=True,
-            append_images=images[1:],
-            duration=round(1000 * delay),
-            optimize=False,
-            disposal=1,
-            loop=0,
-        )
+        images[0].save(partial, format="GIF", append_images=images[1:], **animated)
     return Path(path).stat().st_size
 
 
 def side_by_side(
     real: np.ndarray | torch.Tensor, imagined: np.ndarray | torch.Tensor, context: int, scale: int = 4
 ) -> np.ndarray:
-    """Compose on-board view | prediction.
+    """Compose on-board view | prediction, (T, scale H + 8, 2 (scale W + 8), 3), with pixels enlarged without blurring.
 
-    The prediction's border is green while the model observes the images and orange while it predicts open loop.
-
-    Args:
-        real: (T, H, W, 3) uint8.
-        imagined: (T, H, W, 3) uint8.
-        context: number of first frames that the model observed.
-        scale: integer factor by which pixels are enlarged, without blurring.
-
-    Returns:
-        (T, scale H + 8, 2 (scale W + 8), 3) uint8.
-
-    Raises:
-        ValueError: the frames have another shape or type, or different shapes.
+    The prediction's border is green in the ``context`` that the model observes, and orange while it predicts open loop.
     """
     seen, predicted = _as_frames(real, "real"), _as_frames(imagined, "imagined")
-    if seen.shape != predicted.shape:
-        raise ValueError(f"real has shape {seen.shape}, imagined {predicted.shape}; they must be equal.")
     phase = np.full((len(seen), 3), OPEN_LOOP_COLOR, dtype=np.uint8)  # (T, 3)
     phase[:context] = CONTEXT_COLOR
     framed = [
@@ -139,7 +119,7 @@ def enlarge(pixels: np.ndarray, scale: int) -> np.ndarray:
 
 
 def enlarge_to_watch(pixels: np.ndarray) -> np.ndarray:
-    """Enlarge (T, H, W, 3) by the default factor of `write_video`."""
+    """Enlarge (T, H, W, 3) by the smallest integer factor to a height of `VIDEO_HEIGHT` or more."""
     return enlarge(pixels, math.ceil(VIDEO_HEIGHT / pixels.shape[1]))
 
 
@@ -153,14 +133,9 @@ def add_border(panel: np.ndarray, color: np.ndarray, border: int) -> np.ndarray:
 
 
 def top_down_frames(track: Track, trajectory: Trajectory, size: int = 256) -> np.ndarray:
-    """Draw an animated map: the drone from above, its camera's direction, and the most recent part of its path.
-
-    Returns:
-        (K + 1, size, size, 3) uint8, for an episode of K steps.
-    """
+    """Draw an animated map, (K + 1, size, size, 3) uint8: drone, camera's direction, and the last part of the path."""
     background, points = _map_of(track, 2 * size, trajectory.position[:, :2].numpy())
-    view = camera_directions(trajectory.attitude, tilt_of(trajectory))[:, :2].numpy()
-    view = view * (1.0, -1.0)  # image rows go down
+    view = camera_directions(trajectory.attitude, trajectory.camera_tilt)[:, :2].numpy() * (1.0, -1.0)  # rows go down
     speed = trajectory.speed.numpy()
     colors = (255 * SPEED_COLORS(speed / max(1.0, float(np.nanmax(speed))))[:, :3]).astype(int)
     length = round(MAP_TAIL / trajectory.control_dt)
@@ -177,22 +152,12 @@ def top_down_frames(track: Track, trajectory: Trajectory, size: int = 256) -> np
 
 
 def onboard_beside_map(track: Track, trajectory: Trajectory, size: int = 256) -> np.ndarray:
-    """Compose on-board view | animated map, of an episode of K steps with square images.
+    """Compose on-board view | animated map, (K + 1, side, 2 side + `GAP`, 3), of an episode with square images.
 
     Images are enlarged by an integer factor to a side of at least ``size`` pixels.
-
-    Returns:
-        (K + 1, side, 2 side + `GAP`, 3) uint8.
-
-    Raises:
-        ValueError: there are no images, or they are not square.
     """
-    if trajectory.pixels is None:
-        raise ValueError("the trajectory has no images: record it in an environment with from_pixels=True.")
-    height, width = trajectory.pixels.shape[1:3]
-    if height != width:
-        raise ValueError(f"images of {height} × {width} pixels do not fit beside a square map.")
-    view = enlarge(trajectory.pixels.numpy(), math.ceil(size / height))
+    assert trajectory.pixels is not None
+    view = enlarge(trajectory.pixels.numpy(), math.ceil(size / trajectory.pixels.shape[1]))
     side = view.shape[1]
     between = np.full((len(view), side, GAP, 3), 255, dtype=np.uint8)
     return np.concatenate((view, between, top_down_frames(track, trajectory, side)), axis=2)
@@ -243,12 +208,6 @@ def _make_even(frame: np.ndarray) -> np.ndarray:
     return np.pad(frame, ((0, height % 2), (0, width % 2), (0, 0)), mode="edge")
 
 
-def _shared_palette(frames: np.ndarray, colors: int) -> Image.Image:
-    """Compute a common palette from up to 16 evenly spaced frames."""
-    chosen = frames[np.linspace(0, len(frames) - 1, min(16, len(frames))).round().astype(int)]
-    return Image.fromarray(chosen.reshape(-1, *chosen.shape[2:])).quantize(colors, method=Image.Quantize.MEDIANCUT)
-
-
 def shown_frames(dream: Dream) -> list[int]:
     """Choose `STRIP_FRAMES` to show: the last two of the context, then evenly spaced ones to the end."""
     last = dream.real.shape[1] - 1
@@ -258,12 +217,9 @@ def shown_frames(dream: Dream) -> list[int]:
 
 
 def film_strip(dream: Dream, frames: Sequence[int]) -> np.ndarray:
-    """Compose frames of the first window side by side in three rows: real, reconstructed, imagined.
+    """Compose F frames of the first window in three rows: real, reconstructed, imagined; (3 (2 H + 6), F (2 W + 6), 3).
 
     Borders of the lower two rows are green where the model has observed the image and orange where it predicts.
-
-    Returns:
-        (3 (2 H + 6), F (2 W + 6), 3) uint8: pixels are enlarged twice, and borders have 3 pixels.
     """
     chosen = np.array(frames)
     seen = np.where((chosen < dream.context)[:, None], CONTEXT_COLOR, OPEN_LOOP_COLOR)  # (F, 3)
@@ -273,3 +229,87 @@ def film_strip(dream: Dream, frames: Sequence[int]) -> np.ndarray:
         for images, color in zip((dream.real, dream.reconstructed, dream.imagined), colors, strict=True)
     ]
     return np.concatenate(rows)
+
+
+def race_words(track: Track, trajectory: Trajectory) -> list[str]:
+    """Return captions with time, speed, next gate and lap for each of the K + 1 rows of an episode from its start."""
+    completed = laps_completed(trajectory).tolist()
+    speeds = [f"{speed:4.1f} m/s" if math.isfinite(speed) else " lost" for speed in trajectory.speed.tolist()]
+    rows = zip(speeds, trajectory.target_gate.tolist(), completed, strict=True)
+    return [
+        f"{row * trajectory.control_dt:5.2f} s  {speed}  gate {target + 1}/{track.num_gates}  "
+        f"lap {min(laps + 1, track.laps)}/{track.laps}"
+        for row, (speed, target, laps) in enumerate(rows)
+    ]
+
+
+def laps_completed(trajectory: Trajectory) -> np.ndarray:
+    """Count the completed laps at every row of a flight from its start, (K + 1,)."""
+    # A lap ends where the index of the next gate decreases: to 0, or above 0 if one step passed two gates.
+    gate = trajectory.target_gate.numpy()
+    return np.concatenate(([0], np.cumsum(gate[1:] < gate[:-1])))
+
+
+def second_lap(trajectory: Trajectory) -> tuple[int, int]:
+    """Return the first and last step of the second lap, flown at racing speed; else of the flight's beginning."""
+    ends = (np.diff(laps_completed(trajectory)).nonzero()[0] + 1).tolist()
+    return (ends[0], ends[1]) if len(ends) > 1 else (0, min(BEGINNING, len(trajectory.action)))
+
+
+def dream_words(frames: int, context: int, frame_dt: float, cycle: int | None = None) -> list[str]:
+    """Return captions: whether the model observes a frame, in the context of each cycle, or how long it imagined."""
+    place = [frame % cycle if cycle else frame for frame in range(frames)]
+    return [SEEN if at < context else f"imagined {(at - context + 1) * frame_dt:+.2f} s" for at in place]
+
+
+def slow_motion(seconds: float) -> int:
+    """Return the integer factor of slow motion for a flight's duration; flights of untrained policies are short."""
+    return min(SLOWEST, max(1, math.ceil(SHORTEST_FILM / max(seconds, 1e-6))))
+
+
+def caption(frames: np.ndarray, left: Sequence[str], right: Sequence[str] = ()) -> np.ndarray:
+    """Add a strip with a caption above every frame, (T, H, W, 3) → (T, H + strip, W, 3) uint8.
+
+    Captions above the right half, if any, are green if `SEEN`, else orange.
+    """
+    width = frames.shape[2]
+    room = (width // 2 if right else width) - 2 * MARGIN
+    font = _fitting_font(max((*left, *right), key=len), room)
+    height = round(font.size) + 8
+    strips = np.empty((len(left), height, width, 3), np.uint8)
+    for index, (words, beside) in enumerate(zip(left, right or [""] * len(left), strict=True)):
+        strip = Image.new("RGB", (width, height), STRIP_COLOR)
+        draw = ImageDraw.Draw(strip)
+        draw.text((MARGIN, 3), words, fill=WHITE, font=font)
+        if beside:
+            color = CONTEXT_COLOR if beside == SEEN else OPEN_LOOP_COLOR
+            draw.text((width // 2 + MARGIN, 3), beside, fill=color, font=font)
+        strips[index] = np.asarray(strip)
+    return np.concatenate((strips, frames), axis=1)
+
+
+def dream_video(dreams: Sequence[tuple[str, Dream]]) -> np.ndarray:
+    """Compose named stages of training below each other, each as real | imagined; shorter ones hold their last frame.
+
+    The windows of a stage are shown one after another.
+    """
+    films = [_film(name, dream) for name, dream in dreams]
+    length = max(map(len, films))
+    held = [np.concatenate((film, film[-1:].repeat(length - len(film), axis=0))) for film in films]
+    return np.concatenate(held, axis=1)
+
+
+def _fitting_font(line: str, room: int) -> ImageFont.FreeTypeFont:
+    """Return the largest font in which a line is at most ``room`` pixels wide, or the smallest if none is."""
+    for size in LETTER_SIZES:
+        font = cast(ImageFont.FreeTypeFont, ImageFont.load_default(size=size))
+        if font.getlength(line) <= room:
+            break
+    return font
+
+
+def _film(name: str, dream: Dream) -> np.ndarray:
+    pairs = zip(dream.real, dream.imagined, strict=True)
+    frames = np.concatenate([side_by_side(*pair, context=dream.context, scale=2) for pair in pairs])
+    words = dream_words(len(frames), dream.context, dream.frame_dt, cycle=dream.real.shape[1])
+    return caption(frames, [name] * len(frames), words)

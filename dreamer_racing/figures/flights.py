@@ -1,8 +1,4 @@
-"""Figures of stored evaluations: flights side by side, and reconstructions and predictions of the world model.
-
-They are drawn from files in `evaluations/`, without a simulator or a network.
-Shapes: K control steps of an episode.
-"""
+"""Figures of tracks, of flights, alone and side by side, and of a world model's dreams, without a simulator."""
 
 from __future__ import annotations
 
@@ -11,30 +7,108 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.colors import Normalize
 from matplotlib.figure import Figure
 from matplotlib.layout_engine import ConstrainedLayoutEngine
 from matplotlib.lines import Line2D
+from matplotlib.patches import Rectangle
 
 from dreamer_racing.envs.tracks import Track
 from dreamer_racing.evaluation.dreams import Dream
 from dreamer_racing.evaluation.trajectory import Trajectory
 from dreamer_racing.figures.drawing import (
+    BADGE,
+    BOX,
+    GATE_COLOR,
     INK,
     draw_flight,
     draw_speed_scale,
     draw_track,
+    dress_map,
     flight_legend,
     save,
     speed_scale,
 )
 from dreamer_racing.figures.film import CONTEXT_COLOR, OPEN_LOOP_COLOR, STRIP_FRAMES, film_strip, shown_frames
-from dreamer_racing.figures.profiles import PROFILE_AXES, altitude_legend, draw_altitude, draw_speed
-from dreamer_racing.settings import check_choice
+from dreamer_racing.figures.profiles import altitude_legend, draw_altitude, draw_speed
 
+COLUMNS = 3  # of several flights or tracks
+CELL = (5.0, 5.6)  # width and height per track, inches
+HEIGHT_SPREAD = 0.5  # m between gates, above which a side view is drawn
+ALTITUDE_HEIGHT = 1.5  # of the panel below a single flight, inches
 TITLE_ROOM = 0.35  # space above the panels, inches
 PROFILE_HEIGHT = 1.3  # height of a profile, inches
+
+
+def plot_top_down(track: Track, trajectory: Trajectory, path: str | Path) -> None:
+    """Draw a track and the path of one episode from above, its altitude, and a side view if gates differ in height.
+
+    Black arrows along the path are the camera's direction, as in the paper's figure of perception-aware flight.
+    """
+    figure, axes, side, altitude = _layout(track)
+    speed = speed_scale([trajectory])
+    draw_track(axes, track)
+    draw_flight(axes, trajectory, speed)
+    if side is not None:
+        draw_track_side(side, track)
+        draw_flight(side, trajectory, speed, plane=(0, 2))
+    draw_altitude(altitude, track, trajectory, speed, over="time")
+    draw_speed_scale(figure, figure.axes, speed)
+    top = float(np.nanmax(trajectory.speed.numpy()))
+    title = f"{track.name}: {trajectory.duration:.2f} s, up to {top:.1f} m/s ({trajectory.ending})"
+    axes.set_title(title, loc="left", fontsize=11, color=INK, pad=8)
+    handles = flight_legend(bool(track.decoys), trajectory.crashed) + altitude_legend([(track, trajectory)])
+    figure.legend(handles=handles, loc="outside lower left", ncols=4, frameon=False, fontsize=9)
+    save(figure, path)
+
+
+def _layout(track: Track) -> tuple[Figure, Axes, Axes | None, Axes]:
+    """Create a figure 9 inches wide with map and optional side view, both to the track's scale, and altitude."""
+    width, depth, height = (high - low for low, high in zip(track.bounds_low, track.bounds_high, strict=True))
+    heights = [gate.position[2] for gate in track.gates]
+    metres = [depth, height] if max(heights) - min(heights) > HEIGHT_SPREAD else [depth]
+    rows = [7.6 / width * size for size in metres] + [ALTITUDE_HEIGHT]  # inches
+    figure = Figure(figsize=(9.0, sum(rows) + 0.6 * len(rows) + 0.9), layout="constrained")
+    axes, *side, altitude = figure.subplots(len(rows), 1, height_ratios=rows)
+    return figure, axes, side[0] if side else None, altitude
+
+
+def draw_track_side(axes: Axes, track: Track) -> None:
+    """Draw a track from the side (x–z plane) with numbered gates, each as the outline of its frame."""
+    (x_low, _, z_low), (x_high, _, z_high) = track.bounds_low, track.bounds_high
+    axes.add_patch(Rectangle((x_low, z_low), x_high - x_low, z_high - z_low, **BOX))
+    outer = track.shape.outer
+    labels: list[tuple[float, float]] = []
+    for number, gate in enumerate(track.gates, start=1):
+        width = max(outer * abs(gate.left[0]), 0.15)
+        x, _, z = gate.position
+        corner = (x - width / 2, z - outer / 2)
+        axes.add_patch(Rectangle(corner, width, outer, fill=False, edgecolor=GATE_COLOR, linewidth=2.0, zorder=4))
+        while any(math.dist((x, z), label) < 0.6 for label in labels):
+            z += 0.3  # above the number of another gate at the same place
+        labels.append((x, z))
+        axes.text(x, z, str(number), ha="center", va="center", fontsize=9, color=INK, bbox=BADGE, zorder=7)
+    axes.set(xlabel="x (m)", ylim=(min(z_low, 0.0) - 0.2, z_high + 0.2))
+    dress_map(axes, "z (m)")
+
+
+def plot_tracks(tracks: Sequence[Track], path: str | Path) -> None:
+    """Draw each track from above and from the side, with gate numbers and the direction of flight."""
+    columns = min(len(tracks), COLUMNS)
+    rows = math.ceil(len(tracks) / columns)
+    figure = Figure(figsize=(CELL[0] * columns, CELL[1] * rows), layout="constrained")
+    cells = figure.subfigures(rows, columns, squeeze=False).flat
+    for cell, track in zip(cells, tracks, strict=False):  # the last row may have empty cells
+        _, depth, height = (high - low for low, high in zip(track.bounds_low, track.bounds_high, strict=True))
+        above, side = cell.subplots(2, 1, sharex=True, height_ratios=[depth, height])
+        draw_track(above, track)
+        above.set_xlabel("")
+        draw_track_side(side, track)
+        title = f"{track.name}: {track.num_gates} gates, {sum(track.gate_distances):.1f} m"
+        cell.suptitle(title, x=0.02, ha="left", fontsize=11, color=INK)  # not a title of the map, whose height varies
+    save(figure, path)
 
 
 class NamedFlight(NamedTuple):
@@ -46,27 +120,18 @@ class NamedFlight(NamedTuple):
 
 
 def plot_flights(
-    flights: Sequence[NamedFlight],
-    path: str | Path,
-    over: str = "distance",
-    columns: int = 3,
-    problems: Sequence[str] = (),
+    flights: Sequence[NamedFlight], path: str | Path, over: str = "distance", problems: Sequence[str] = ()
 ) -> None:
     """Draw flights from above side by side, at one scale, with the camera's direction; altitude and speed below.
 
     Reference: paper, Figs. "emergent" (with decoys and without) and "real world" (simulated and real).
 
     Profiles are over an axis of `PROFILE_AXES`. ``problems`` are lines for everything left out.
-
-    Raises:
-        ValueError: there are no flights, or the axis is unknown.
     """
-    if not flights:
-        raise ValueError("no flights to draw.")
-    check_choice("over", over, PROFILE_AXES)
-    columns = min(columns, len(flights))
+    columns = min(COLUMNS, len(flights))
     rows = math.ceil(len(flights) / columns)
-    half = [max(size) / 2 for size in zip(*(_floor_size(flight.track) for flight in flights), strict=True)]  # m
+    halls = [np.subtract(flight.track.bounds_high, flight.track.bounds_low) for flight in flights]
+    half = np.max(halls, axis=0)[:2] / 2  # m
     top = 4.4 * half[1] / half[0]  # inches
     width, height = 4.6 * columns + 0.7, rows * (top + 2 * PROFILE_HEIGHT + 0.9) + 0.5 + TITLE_ROOM
     figure = Figure(figsize=(width, height))
@@ -90,7 +155,7 @@ def plot_flights(
 
 
 def _draw_flight_and_profiles(
-    panels: Sequence[Axes], flight: NamedFlight, speed: Normalize, half: Sequence[float], over: str
+    panels: Sequence[Axes], flight: NamedFlight, speed: Normalize, half: np.ndarray, over: str
 ) -> None:
     """Draw a map that extends ``half`` (x, y), m, from the hall's middle to each side; below it altitude and speed."""
     axes, altitude, profile = panels
@@ -106,24 +171,11 @@ def _draw_flight_and_profiles(
     altitude.set_xlabel("")
 
 
-def _floor_size(track: Track) -> tuple[float, float]:
-    """Return width and depth of a track's bounding box, m."""
-    (x_low, y_low, _), (x_high, y_high, _) = track.bounds_low, track.bounds_high
-    return x_high - x_low, y_high - y_low
-
-
 def plot_dreams(dreams: Sequence[tuple[str, Dream]], path: str | Path, problems: Sequence[str] = ()) -> None:
-    """Draw real, reconstructed and imagined observations of named stages of training, time from left to right.
-
-    Only the first window of each is shown.
+    """Draw real, reconstructed and imagined observations of named stages of training, the first window of each.
 
     Reference: paper, Fig. "imagined".
-
-    Raises:
-        ValueError: there are no dreams.
     """
-    if not dreams:
-        raise ValueError("no dreams to draw.")
     figure = Figure(figsize=(1.4 + 1.15 * STRIP_FRAMES, 4.0 * len(dreams) + 0.3), layout="compressed")
     panels = figure.subplots(len(dreams), 1, squeeze=False)[:, 0]
     for axes, (name, dream) in zip(panels, dreams, strict=True):
@@ -142,13 +194,10 @@ def plot_dreams(dreams: Sequence[tuple[str, Dream]], path: str | Path, problems:
         axes.spines[:].set_visible(False)
         axes.set_title(name, loc="left", fontsize=10, color=INK)
     square: dict[str, Any] = {"marker": "s", "linestyle": "", "markersize": 7}
-    phases = (
-        (CONTEXT_COLOR, "the model has seen this image"),
-        (OPEN_LOOP_COLOR, "predicted from actions alone, from 0 s on"),
-    )
+    labels = "the model has seen this image", "predicted from actions alone, from 0 s on"
     handles = [
-        Line2D([], [], color=(red / 255, green / 255, blue / 255), label=label, **square)
-        for (red, green, blue), label in phases
+        Line2D([], [], color=tuple(np.divide(color, 255)), label=label, **square)
+        for color, label in zip((CONTEXT_COLOR, OPEN_LOOP_COLOR), labels, strict=True)
     ]
     figure.legend(handles=handles, loc="outside lower left", ncols=2, frameon=False, fontsize=9)
     save(figure, path, problems)

@@ -41,16 +41,13 @@ LABELS = {
 
 
 def write_report(flight_path: Path, against: Path | None = None) -> list[str]:
-    """Write ``report.json`` and figures into the folder of a recorded flight, replacing an earlier report.
+    """Write ``report.json`` and figures into the folder of a recorded flight; return lines of a summary.
 
     Reference: paper, Fig. "real world": trajectories with the camera's direction, and speed profiles.
 
     Args:
         flight_path: The recording, or its folder.
         against: Flight to compare with: another recording, or the trajectory (CSV) of an evaluation.
-
-    Returns:
-        Lines of a summary to print.
 
     Raises:
         FileNotFoundError: A flight does not exist.
@@ -69,7 +66,7 @@ def write_report(flight_path: Path, against: Path | None = None) -> list[str]:
     if own is not None:
         report["flown"] = _summary(own)
         shown = [NamedFlight("flown", flight.track, own)] + ([other] if other else [])
-        plot_flights(shown, folder / TRAJECTORY, columns=2, problems=report["problems"])
+        plot_flights(shown, folder / TRAJECTORY, problems=report["problems"])
     if other is not None:
         report["against"] = {"path": str(against), "title": other.title, **_summary(other.trajectory)}
     if any(report["tracking"].values()):
@@ -83,8 +80,7 @@ def write_report(flight_path: Path, against: Path | None = None) -> list[str]:
 def trajectory_of(flight: FlownFlight) -> Trajectory | None:
     """Return the armed part of the flight as a trajectory; None if it is shorter than one step.
 
-    Rows are the poses that the flyer used, actions the commands in SI units. ``control_dt`` is the mean time between
-    ticks.
+    Rows are the poses that the flyer used, actions the commands in SI units.
     """
     ticks = np.arange(len(flight.time))[flight.flown]
     ticks = ticks[np.isfinite(flight.seen[ticks]).all(axis=1)]
@@ -100,14 +96,13 @@ def trajectory_of(flight: FlownFlight) -> Trajectory | None:
         target_gate=torch.from_numpy(flight.target_gate[ticks]),
         action=torch.from_numpy(flight.command[ticks[:-1]]).float(),
         pixels=None,
-        control_dt=duration / (len(ticks) - 1),
+        control_dt=duration / (len(ticks) - 1),  # the mean
         outcome=flight.ended,
         camera_tilt=camera.get("tilt_up_deg"),
     )
 
 
 def _read_other(path: Path) -> NamedFlight:
-    """Read the flight to compare with."""
     if path.suffix == ".csv":
         if not path.is_file():
             raise FileNotFoundError(f"against={path}: there is no such file.")
@@ -192,7 +187,7 @@ def _draw_latencies(latency: dict[str, Any], rate: float | None, path: Path) -> 
 
 
 def _decades(values: Sequence[float]) -> tuple[float, float]:
-    """Return powers of ten as axis limits around positive values, with a margin; one decade around 1 if empty."""
+    """Return powers of ten around positive values, with a margin; one decade around 1 if there are none."""
     low, high = min(values, default=1.0), max(values, default=1.0)
     return 10.0 ** math.floor(math.log10(0.8 * low)), 10.0 ** math.ceil(math.log10(1.25 * high))
 
@@ -200,7 +195,6 @@ def _decades(values: Sequence[float]) -> tuple[float, float]:
 def _draw_tracking(
     response: dict[str, Response], errors: dict[str, dict[str, float | None] | None], began: float, path: Path
 ) -> None:
-    """Draw commands and measurements over the time since arming."""
     figure = Figure(figsize=(9.0, 1.75 * len(response) + 0.5), layout="constrained")
     panels = figure.subplots(len(response), 1, sharex=True, squeeze=False)[:, 0]
     for axes, (name, (asked_time, asked, time, measured)) in zip(panels, response.items(), strict=True):
@@ -224,15 +218,16 @@ def _error_text(name: str, error: dict[str, float | None] | None) -> str:
 
 
 def _lines(report: dict[str, Any]) -> list[str]:
-    """Return the lines of the summary."""
     lines = [
         f"{report['actor'] or 'flight'} on {report['track']}: armed for {report['armed_s']:.2f} s of "
         f"{report['duration_s']:.2f} s, ended: {report['ended']}",
         f"latencies of {report['latency']['of']} (ms); deadlines missed: {report['latency']['missed_deadlines']}",
     ]
-    for name, row in report["latency"]["stages"].items():
-        if row is not None:
-            lines.append(f"  {name:<11} p50 {row['p50_ms']:7.2f}   p99 {row['p99_ms']:7.2f}   max {row['max_ms']:7.2f}")
+    lines += [
+        f"  {name:<11} p50 {row['p50_ms']:7.2f}   p99 {row['p99_ms']:7.2f}   max {row['max_ms']:7.2f}"
+        for name, row in report["latency"]["stages"].items()
+        if row is not None
+    ]
     offsets = [passed["offset_m"] for passed in report["gates"]]
     middle = f", {np.mean(offsets):.2f} m from the centre on average, {max(offsets):.2f} m at most" if offsets else ""
     lines.append(f"gates passed: {len(offsets)}{middle}")

@@ -24,6 +24,7 @@ from dreamer_racing.hil.vehicle import Pose
 LAG_MAX, LAG_STEP = 0.3, 0.001  # s, of the lags tried between a command and the measured motion [choice]
 FEWEST = 20  # measurements for a tracking error [choice]
 ACCELERATION_WINDOW = 0.04  # s, two control steps: for the difference of velocities that gives the thrust [choice]
+LIMITS = ("speed_max", "jump_tolerance", "clock_drift_max")  # safety limits that are read from a recording
 STAGES = ("jitter", "render", "act", "sent")
 """Recorded times of each tick: its delay, and the durations of its stages."""
 CHANNELS = {"collective_thrust": "m/s²", "body_rate_x": "rad/s", "body_rate_y": "rad/s", "body_rate_z": "rad/s"}
@@ -34,41 +35,25 @@ CHANNELS = {"collective_thrust": "m/s²", "body_rate_x": "rad/s", "body_rate_y":
 class FlownFlight:
     """Arrays of a recorded flight."""
 
-    path: Path
-    """Path of the recording, or of its folder."""
-    about: dict[str, Any]
-    """Metadata of the flight from the recording."""
-    whole: bool
-    """Whether the recording is complete."""
-    holds_track: bool
-    """Whether the recording holds the track; if not, `track` is the current track of the recorded name."""
+    path: Path  # of the recording, or of its folder
+    about: dict[str, Any]  # metadata from the recording
+    whole: bool  # whether the recording is complete
+    holds_track: bool  # whether the recording holds the track; if not, `track` is today's of the recorded name
     track: Track
-    limits: SafetyLimits
-    """Safety limits; only those on the distance between poses are read from the recording."""
-    time: np.ndarray
-    """(T,) start of each tick on the loop's clock, s."""
-    armed: np.ndarray
-    """(T,) bool."""
-    command: np.ndarray
-    """(T, 4) commands sent: collective thrust in m/s² and body rates in rad/s."""
+    limits: SafetyLimits  # only `LIMITS` are read from the recording
+    time: np.ndarray  # (T,) start of each tick on the loop's clock, s
+    armed: np.ndarray  # (T,) bool
+    command: np.ndarray  # (T, 4) commands sent: collective thrust in m/s² and body rates in rad/s
     seen: np.ndarray
     """(T, 13) pose used in each tick: position, attitude wxyz, velocity, body rates; NaN without a pose."""
-    target_gate: np.ndarray
-    """(T,) int."""
-    passes: np.ndarray
-    """(T,) int: the loop's count of gates passed."""
-    took: dict[str, np.ndarray]
-    """(T,) s each: ``jitter``, ``render``, ``act``, ``sent``."""
-    overrun: np.ndarray
-    """(T,) int: deadlines missed in the previous tick."""
-    pose_age: np.ndarray
-    """(T,) s from the newest pose's measurement to the tick; NaN without a pose."""
-    poses: list[Pose]
-    """(P,) poses with timestamps on the loop's clock."""
-    arrived: np.ndarray
-    """(P,) int: index of the tick that read each pose."""
-    out_of_order: int
-    """Number of poses that arrived out of order and were dropped."""
+    target_gate: np.ndarray  # (T,) int
+    passes: np.ndarray  # (T,) int: the loop's count of gates passed
+    took: dict[str, np.ndarray]  # (T,) s each, by `STAGES`
+    overrun: np.ndarray  # (T,) int: deadlines missed in the previous tick
+    pose_age: np.ndarray  # (T,) s from the newest pose's measurement to the tick; NaN without a pose
+    poses: list[Pose]  # P, with timestamps on the loop's clock
+    arrived: np.ndarray  # (P,) int: index of the tick that read each pose
+    out_of_order: int  # number of poses that arrived out of order and were dropped
     ended: str | None
     """State and reasons with which the flight ended; None if it was armed until the last tick, or never."""
 
@@ -82,13 +67,10 @@ class FlownFlight:
 class Response(NamedTuple):
     """Commands and measurements of one channel."""
 
-    asked_time: np.ndarray
-    """(T',) time at which each armed command was sent, s."""
-    asked: np.ndarray
-    """(T',) commands; each holds until the next."""
-    time: np.ndarray
-    """(M,) times of the measurements, s."""
-    measured: np.ndarray
+    asked_time: np.ndarray  # (T',) time at which each armed command was sent, s
+    asked: np.ndarray  # (T',) each holds until the next
+    time: np.ndarray  # (M,) of the measurements, s
+    measured: np.ndarray  # (M,)
 
 
 def read_flown(path: Path) -> FlownFlight:
@@ -104,7 +86,11 @@ def read_flown(path: Path) -> FlownFlight:
     try:
         config = flight.about.get("config") or {}
         track = flight.track()
-        clock, limits = _clock_of(config), _limits_of(config, track)
+        set_then = config.get("limits") or {}
+        names = [name for name in LIMITS if set_then.get(name) is not None]
+        limits = SafetyLimits.of_track(track, **{name: float(set_then[name]) for name in names})
+        stamping, latency = Stamping(config.get("stamping", "receive")), float(config.get("latency", 0.0))
+        clock = PoseClock(stamping, latency, limits.clock_drift_max)
         arrays = _read_ticks(flight.ticks, clock)
     except TrackError as error:
         raise ValueError(f"{path}: {error}") from error
@@ -116,47 +102,27 @@ def read_flown(path: Path) -> FlownFlight:
     )
 
 
-def _clock_of(config: dict[str, Any]) -> PoseClock:
-    drift = (config.get("limits") or {}).get("clock_drift_max")
-    given = {} if drift is None else {"drift_max": float(drift)}
-    return PoseClock(Stamping(config.get("stamping", "receive")), float(config.get("latency", 0.0)), **given)
-
-
-def _limits_of(config: dict[str, Any], track: Track) -> SafetyLimits:
-    """Return a flight's safety limits, with the recorded limits on the distance between poses."""
-    set_then = config.get("limits") or {}
-    names = [name for name in ("speed_max", "jump_tolerance") if set_then.get(name) is not None]
-    return SafetyLimits.of_track(track, **{name: float(set_then[name]) for name in names})
-
-
 def latencies(flight: FlownFlight) -> dict[str, Any]:
-    """Return p50, p99 and maximum of each stage in ms, over armed ticks, or over all ticks if none is armed.
-
-    | stage | from | to |
-    |---|---|---|
-    | ``jitter`` | scheduled start of the tick | start of the tick |
-    | ``interval`` | start of a tick | start of the next tick |
-    | ``pose_age`` | timestamp of the newest pose | start of the tick |
-    | ``render``, ``act`` | | durations of rendering and of the flyer |
-    | ``sent`` | start of the tick | the command is sent |
-    | ``end_to_end`` | timestamp of the newest pose | the command is sent |
-    """
+    """Return p50, p99 and maximum of each stage in ms, over armed ticks, or over all ticks if none is armed."""
     armed = bool(flight.armed.any())
     ticks = flight.armed if armed else np.ones(len(flight.time), bool)
     took, blind = flight.took, (flight.about.get("contract") or {}).get("camera") is None
     stages = {
-        "jitter": took["jitter"][ticks],
-        "interval": np.diff(flight.time)[ticks[1:] & ticks[:-1]],
-        "pose_age": flight.pose_age[ticks],
+        "jitter": took["jitter"][ticks],  # from the scheduled start of the tick to its start
+        "interval": np.diff(flight.time)[ticks[1:] & ticks[:-1]],  # from start to start
+        "pose_age": flight.pose_age[ticks],  # from the timestamp of the newest pose to the start of the tick
         "render": np.empty(0) if blind else took["render"][ticks],
-        "act": took["act"][ticks],
-        "sent": took["sent"][ticks],
-        "end_to_end": (flight.pose_age + took["sent"])[ticks],
+        "act": took["act"][ticks],  # of the flyer
+        "sent": took["sent"][ticks],  # from the start of the tick until the command is sent
+        "end_to_end": (flight.pose_age + took["sent"])[ticks],  # from the timestamp of the newest pose until then
     }
     table = {name: percentiles(values[np.isfinite(values)].tolist()) for name, values in stages.items()}
-    missed = int(flight.overrun.sum())
-    of = "armed ticks" if armed else "all ticks"
-    return {"of": of, "ticks": int(ticks.sum()), "stages": table, "missed_deadlines": missed}
+    return {
+        "of": "armed ticks" if armed else "all ticks",
+        "ticks": int(ticks.sum()),
+        "stages": table,
+        "missed_deadlines": int(flight.overrun.sum()),
+    }
 
 
 def gate_passes(flight: FlownFlight) -> list[GatePass]:
@@ -170,10 +136,9 @@ def gate_passes(flight: FlownFlight) -> list[GatePass]:
 
 
 def lap_times(flight: FlownFlight, passes: list[GatePass]) -> dict[str, list[float]]:
-    """Return lap times, s, counted in two ways.
+    """Return lap times, s: ``flying`` from first gate to first gate; ``race``, as in evaluations, to the last gate.
 
-    ``flying``: between passes of the first gate. ``race``, as in evaluations: between passes of the last gate; the
-    first lap begins at arming.
+    The first lap of a race begins at arming.
     """
     lasts = [passed.time for passed in passes if passed.gate == flight.track.num_gates - 1]
     began = [float(flight.time[flight.flown][0])] if lasts else []
@@ -183,8 +148,7 @@ def lap_times(flight: FlownFlight, passes: list[GatePass]) -> dict[str, list[flo
 def responses(flight: FlownFlight) -> dict[str, Response]:
     """Return the commands and measurements of each channel while armed.
 
-    Thrust is estimated from the poses' velocities: acceleration minus gravity, along body z, which includes drag along
-    this axis.
+    Thrust is estimated from the poses' velocities: acceleration minus gravity along body z, which includes drag.
     """
     armed = flight.armed
     if not armed.any():
@@ -229,7 +193,7 @@ def _rms(values: np.ndarray) -> float:
 
 
 def _commands_at(response: Response, time: np.ndarray) -> np.ndarray:
-    """Return the commands in force at times (M,), (M,)."""
+    """Return the commands in force at times (M,)."""
     return response.asked[np.searchsorted(response.asked_time, time + 1e-9, side="right") - 1]
 
 

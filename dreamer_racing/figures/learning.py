@@ -1,7 +1,4 @@
-"""Figures of training metrics: learning curves over seeds, and comparisons of an experiment's variants.
-
-Shapes: S seeds of a variant.
-"""
+"""Figures of training metrics: learning curves over seeds, and comparisons of an experiment's variants."""
 
 from __future__ import annotations
 
@@ -53,7 +50,7 @@ OTHER_COLOR = "#a5d8ff"  # of other variants
 def plot_learning_curves(curves: LearningCurves, path: str | Path) -> None:
     """Draw a grid with a column per track and a row per quantity; colours are algorithms, line styles variants.
 
-    Ticks at the bottom mark where the curriculum raised b₂, for every seed. A text file names what was left out.
+    Ticks at the bottom mark where the curriculum raised b₂, for every seed.
 
     Reference: paper, Fig. "Reward evolution".
 
@@ -65,7 +62,9 @@ def plot_learning_curves(curves: LearningCurves, path: str | Path) -> None:
     keys = sorted({curve.key._replace(track="") for curve in curves.curves}, key=_rank)
     styles = line_styles(keys)
     width = max(7.0, 0.6 + 3.9 * len(tracks))
-    labels = {key: f"{_label(key)} ({_seed_count(curves, key)})" for key in keys}
+    names = {key: ALGORITHMS.get(key.algorithm, (key.algorithm,))[0] for key in keys}
+    labels = {key: ", ".join(filter(None, (names[key], key.variant))) for key in keys}
+    labels = {key: f"{label} ({_seed_count(curves, key)})" for key, label in labels.items()}
     columns = max(1, int((width - 0.8) / (0.6 + LETTER * max(map(len, labels.values())))))
     caption = textwrap.wrap(_caption(curves, styles), int((width - 0.8) / LETTER))
     lines = len(caption) + math.ceil((len(keys) + any(map(len, curves.raises.values()))) / columns)
@@ -148,7 +147,6 @@ def _draw_raises(axes: Axes, curves: LearningCurves, track: str, styles: Styles)
 
 
 def _draw_legend(axes: Axes, handles: Sequence[Line2D], caption: str, columns: int) -> None:
-    """Draw legend and caption below the panels."""
     axes.set_axis_off()
     style: Style = {"frameon": False, "fontsize": 9, "borderaxespad": 0.0, "labelcolor": INK}
     legend = axes.legend(handles=handles, loc="upper left", ncols=columns, title=caption, alignment="left", **style)
@@ -156,7 +154,6 @@ def _draw_legend(axes: Axes, handles: Sequence[Line2D], caption: str, columns: i
 
 
 def _caption(curves: LearningCurves, styles: Styles) -> str:
-    """Return a caption that names the aggregate, the band and the window."""
     centre, band = BANDS[curves.aggregate]
     of = " of the default only" if any(_has_many_variants(key, styles) for key in styles) else ""
     window = f"{curves.window:.2g}"
@@ -172,8 +169,11 @@ def _seed_count(curves: LearningCurves, key: CurveKey) -> str:
     for curve in curves.curves:
         track = curve.key.track
         if curve.key._replace(track="") == key and track != ALL_TRACKS:
+            # Slightly before the last value, because runs do not end at the same step.
+            end = ENDS_EARLY * curve.x[curve.seeds > 0].max(initial=0.0)
+            at_the_end = int(curve.seeds[np.searchsorted(curve.x, end, "right") - 1])
             most, last = counts.get(track, (0, 0))
-            counts[track] = max(most, int(curve.seeds.max())), max(last, _seeds_at_the_end(curve))
+            counts[track] = max(most, int(curve.seeds.max())), max(last, at_the_end)
     texts = {
         track: f"{most} seed{'s' if most > 1 else ''}" + (f", {last} at the end" if last < most else "")
         for track, (most, last) in counts.items()
@@ -183,39 +183,28 @@ def _seed_count(curves: LearningCurves, key: CurveKey) -> str:
     return "; ".join(f"{_track_title(track)}: {texts[track]}" for track in sorted(texts, key=_place))
 
 
-def _seeds_at_the_end(curve: Curve) -> int:
-    """Count the seeds slightly before the last value, because runs do not end at the same step."""
-    end = ENDS_EARLY * curve.x[curve.seeds > 0].max(initial=0.0)
-    return int(curve.seeds[np.searchsorted(curve.x, end, "right") - 1])
-
-
-def _label(key: CurveKey) -> str:
-    name, _ = ALGORITHMS.get(key.algorithm, (key.algorithm, MUTED))
-    return ", ".join(filter(None, (name, key.variant)))
-
-
 def line_styles(keys: Sequence[CurveKey]) -> Styles:
-    """Choose a distinct line style for each key without track: the algorithm's colour, darker or lighter, and dashes.
+    """Choose distinct line styles for keys without track: the algorithm's colour, darker or lighter, and dashes.
 
     Raises:
         ValueError: an algorithm has more variants than there are line styles.
     """
-    return {key: _line_style(key, [other for other in keys if other.algorithm == key.algorithm]) for key in keys}
-
-
-def _line_style(key: CurveKey, own: Sequence[CurveKey]) -> Style:
+    styles: Styles = {}
     lines, shades = len(VARIANT_LINES), len(VARIANT_SHADES)
-    if len(own) > lines * shades:
-        raise ValueError(
-            f"{len(own)} variants of {key.algorithm}: a figure can show at most {lines * shades}. Draw several "
-            "figures: runs=[...] takes folders and patterns."
-        )
-    index = own.index(key)
-    color = np.array(to_rgb(ALGORITHMS.get(key.algorithm, ("", MUTED))[1]))
-    shade = VARIANT_SHADES[(index + index // lines) % shades]  # shifted after each cycle of dashes
-    mixed = color * (1 + shade) if shade < 0 else color + (1 - color) * shade
-    thin = _has_many_variants(key, own) and not key.is_reference
-    return {"color": tuple(mixed), "linestyle": VARIANT_LINES[index % lines], "linewidth": 1.2 if thin else 1.9}
+    for key in keys:
+        own = [other for other in keys if other.algorithm == key.algorithm]
+        if len(own) > lines * shades:
+            raise ValueError(
+                f"{len(own)} variants of {key.algorithm}: a figure can show at most {lines * shades}. Draw several "
+                "figures: runs=[...] takes folders and patterns."
+            )
+        index = own.index(key)
+        color = np.array(to_rgb(ALGORITHMS.get(key.algorithm, ("", MUTED))[1]))
+        shade = VARIANT_SHADES[(index + index // lines) % shades]  # shifted after each cycle of dashes
+        mixed = color * (1 + shade) if shade < 0 else color + (1 - color) * shade
+        width = 1.2 if _has_many_variants(key, own) and not key.is_reference else 1.9
+        styles[key] = {"color": tuple(mixed), "linestyle": VARIANT_LINES[index % lines], "linewidth": width}
+    return styles
 
 
 def _has_many_variants(key: CurveKey, keys: Collection[CurveKey]) -> bool:
@@ -238,10 +227,7 @@ def _track_title(track: str) -> str:
 
 
 def plot_comparison(comparison: Comparison, path: str | Path) -> None:
-    """Draw a bar per variant with the standard deviation over n seeds, a dot per seed, and a line at the reference.
-
-    Quantities that may be negative have a diamond instead of the bar.
-    """
+    """Draw a bar per variant with the standard deviation over n seeds, a dot per seed, and a line at the reference."""
     results = comparison.results
     shown = [name for name in DRAWN if any(name in result.values for result in results)]
     several = len({result.key[:2] for result in results}) > 1

@@ -1,6 +1,6 @@
 """TensorBoard and Weights & Biases loggers: TorchRL's own, extended to log a run's configuration, images and videos.
 
-`make_loggers` creates them from the configuration. No data leaves the machine unless ``wandb="online"``.
+No data leaves the machine unless ``wandb="online"``.
 """
 
 from __future__ import annotations
@@ -61,10 +61,7 @@ class LoggerConfig:
 def make_loggers(run_dir: str | Path, config: LoggerConfig, resume_env_steps: int | None = None) -> list[RunLogger]:
     """Make the loggers of a run, which write to its folders ``tensorboard`` and ``wandb``.
 
-    Args:
-        run_dir: the run directory.
-        config: settings of the loggers.
-        resume_env_steps: env_steps of the checkpoint that the run resumes from; None for a new run.
+    ``resume_env_steps`` is that of the checkpoint that the run resumes from; None for a new run.
 
     Raises:
         ValueError: W&B is configured but not installed.
@@ -169,12 +166,7 @@ RunLogger = TensorboardRunLogger | WandbRunLogger
 
 
 def read_film(file: Path, max_frames: int, max_width: int) -> tuple[np.ndarray, float]:
-    """Read a video, subsampled in time and space.
-
-    Args:
-        file: mp4 file.
-        max_frames: maximum of T, reached by keeping every second frame, every third, and so on.
-        max_width: maximum of W in pixels, reached in the same way.
+    """Read a video, keeping every second frame and pixel, every third, and so on, to have at most as many.
 
     Returns:
         (T, H, W, 3) uint8, and the frames per second that preserve the video's speed.

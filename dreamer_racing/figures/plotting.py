@@ -1,13 +1,17 @@
 """Figures of stored runs, for `recipes/plot.py` and for the end of an experiment."""
 
+import json
 import logging
+import math
+import os
 import re
+import textwrap
 from collections import Counter
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field, replace
 from enum import Enum
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeVar
 
 from dreamer_racing.evaluation.dreams import Dream
 from dreamer_racing.evaluation.trajectory import NUMBERS, read_trajectory
@@ -20,10 +24,8 @@ from dreamer_racing.figures.curves import (
     wanted_columns,
     write_curves,
 )
-from dreamer_racing.figures.evaluations import evaluation_files, evaluation_score, first_readable
-from dreamer_racing.figures.film import write_gif, write_video
+from dreamer_racing.figures.film import dream_video, enlarge, write_gif, write_video
 from dreamer_racing.figures.flights import NamedFlight, plot_dreams, plot_flights
-from dreamer_racing.figures.hud import dream_video
 from dreamer_racing.figures.learning import plot_comparison, plot_learning_curves
 from dreamer_racing.figures.profiles import PROFILE_AXES
 from dreamer_racing.figures.runs import RunData, find_runs, first_of_each_curve, group_runs, read_runs
@@ -60,16 +62,11 @@ class PlotConfig:
 logger = logging.getLogger(__name__)
 
 VIDEO_SLOWER = 2  # slow-motion factor of videos
-FLIGHTS = ("last", "best")  # values of the setting `flight`
-
-
-class Drawn(NamedTuple):
-    """Result of drawing a figure."""
-
-    files: list[str]
-    """Names in the output folder; empty if the runs have no data for the figure."""
-    problems: list[str]
-    """A line for everything left out."""
+STORED = ("flight", "deterministic")  # prefixes of the files of recipes/fly.py and recipes/evaluate.py
+REASON_LETTERS = 160  # maximum length of the reason why a file cannot be read
+T = TypeVar("T")
+Drawn = tuple[list[str], list[str]]
+"""Names of files in the output folder, none if the runs have no data for the figure, and a line for all left out."""
 
 
 def draw(config: PlotConfig) -> None:
@@ -102,16 +99,12 @@ def draw(config: PlotConfig) -> None:
 
 
 def as_list(value: Any) -> list[str]:
-    """Return a value as a list of strings: a single value as one entry, an empty one as no entry."""
+    """Return a list of strings: of a single value one entry, of an empty one none."""
     return [str(one) for one in (value if isinstance(value, list) else [value] if value else [])]
 
 
 def refuse_for_curves(config: PlotConfig) -> None:
-    """Check that no setting is given that cannot be combined with a file of curves.
-
-    Raises:
-        ValueError: there is such a setting; the message names it.
-    """
+    """Raise ValueError if a setting is given that cannot be combined with a file of curves."""
     names = ("quantities", "axis", "aggregate", "window", "flights", "dreams")
     given = [name for name in names if getattr(config, name) != getattr(PlotConfig(), name)]
     if config.figure not in ("all", "learning_curves"):
@@ -124,18 +117,11 @@ def refuse_for_curves(config: PlotConfig) -> None:
 
 
 def check_plot(config: PlotConfig) -> None:
-    """Check the settings.
-
-    Raises:
-        ValueError: a value is not allowed, or a file does not exist.
-    """
+    """Raise ValueError if a value is not allowed, or a file does not exist."""
     check_settings(config)
-    for name, value, allowed in (
-        ("figure", config.figure, (*FIGURES, "all")),
-        ("flight", config.flight, FLIGHTS),
-        ("over", config.over, PROFILE_AXES),
-    ):
-        check_choice(name, value, allowed)
+    check_choice("figure", config.figure, (*FIGURES, "all"))
+    check_choice("flight", config.flight, ("last", "best"))
+    check_choice("over", config.over, PROFILE_AXES)
     for name, files in (("flights", config.flights), ("dreams", config.dreams)):
         if missing := [str(file) for file in files if not Path(file).is_file()]:
             raise ValueError(f"{name}={missing[0]}: there is no such file.")
@@ -143,11 +129,11 @@ def check_plot(config: PlotConfig) -> None:
 
 
 def draw_all(config: PlotConfig, output: Path, runs: list[RunData], problems: list[str], names: Iterable[str]) -> None:
-    """Draw every figure that has data; if one fails, the others are still drawn.
+    """Draw every figure that has data, also after one failed.
 
     Raises:
         ValueError: nothing could be drawn.
-        Exception: the first exception other than ValueError and OSError, after the other figures were drawn.
+        Exception: the first one that was neither ValueError nor OSError, after the other figures were drawn.
     """
     drawn = False
     failures: dict[str, Exception] = {}
@@ -184,7 +170,7 @@ def draw_learning_curves(config: PlotConfig, output: Path, runs: list[RunData], 
     curves = learning_curves(runs, config.quantities, config.aggregate.value, config.window, problems, config.axis)
     write_curves(output / CURVES, curves)
     plot_learning_curves(curves, output / "learning_curves.png")
-    return Drawn(["learning_curves.png", CURVES], curves.problems)
+    return ["learning_curves.png", CURVES], curves.problems
 
 
 def draw_imagined(config: PlotConfig, output: Path, runs: list[RunData], problems: list[str]) -> Drawn:
@@ -198,16 +184,12 @@ def draw_imagined(config: PlotConfig, output: Path, runs: list[RunData], problem
         if stages:
             names[run.name] += 1  # runs of two experiments may have the same name
             name = f"imagined_{run.name}" + (f"_{names[run.name]}" if names[run.name] > 1 else "")
-            files += draw_dreams(name, stages, left_out, output).files
-    return Drawn(files, missing)
+            files += draw_dreams(name, stages, left_out, output)[0]
+    return files, missing
 
 
 def stages_of_training(run: RunData) -> tuple[dict[Path, Dream], list[str]]:
-    """Read the first, the middle and the last dream of a run; an unreadable one is replaced by the one before it.
-
-    Returns:
-        The dreams by file, without duplicates, and a line for everything left out.
-    """
+    """Read the first, the middle and the last dream of a run; an unreadable one is replaced by the one before it."""
     files = evaluation_files(run.directory, "_dream.npz")
     files = [file for file in files if file.name.partition("_")[0].isdigit()] or files  # of training, if there are any
     problems: list[str] = []
@@ -221,19 +203,18 @@ def draw_dreams(name: str, stages: dict[Path, Dream], problems: list[str], outpu
     dreams = [(stage_name(file), dream) for file, dream in stages.items()]
     plot_dreams(dreams, output / f"{name}.png", problems=problems)
     fps, film = 1 / (VIDEO_SLOWER * dreams[0][1].frame_dt), dream_video(dreams)
-    filmed = write_video(output / f"{name}.mp4", film, fps=fps, scale=2)
+    filmed = write_video(output / f"{name}.mp4", enlarge(film, 2), fps=fps)
     write_gif(output / f"{name}.gif", film, fps=fps)
-    return Drawn([f"{name}.png", *([f"{name}.mp4"] if filmed else []), f"{name}.gif"], problems)
+    return [f"{name}.png", *([f"{name}.mp4"] if filmed else []), f"{name}.gif"], problems
 
 
 def draw_trajectories(config: PlotConfig, output: Path, runs: list[RunData], problems: list[str]) -> Drawn:
     """Write `trajectories.png` of the given files, or of one evaluation of each curve's first seed."""
     missing: list[str] = []
     flights = [named_flight(file) for file in config.flights] or chosen_flights(runs, config.flight, missing)
-    if not flights:
-        return Drawn([], missing)
-    plot_flights(flights, output / "trajectories.png", config.over, problems=missing)
-    return Drawn(["trajectories.png"], missing)
+    if flights:
+        plot_flights(flights, output / "trajectories.png", config.over, problems=missing)
+    return ["trajectories.png"] if flights else [], missing
 
 
 def chosen_flights(runs: list[RunData], which: str, problems: list[str]) -> list[NamedFlight]:
@@ -270,30 +251,81 @@ def stage_name(file: str | Path) -> str:
     return f"{int(name):,} env_steps" if name.isdigit() else name.replace("_", " ")
 
 
+def evaluation_files(directory: Path, ending: str) -> list[Path]:
+    """Find the files of a run's evaluations of the deterministic policy, by their ending.
+
+    First those of training, sorted by env_steps, then those of `recipes/evaluate.py`: `evaluation`, `evaluation_2` ...
+    """
+    files = RunDirectory(directory).evaluations.glob(f"*{ending}")
+    during = {int(name): file for file in files if (name := file.name.removesuffix(ending)).isdigit()}
+    number = {folder: re.fullmatch(r"evaluation(?:_(\d+))?", folder.name) for folder in directory.glob("evaluation*")}
+    folders = sorted((int(match[1] or 1), folder) for folder, match in number.items() if match)
+    after = [RunDirectory(folder).evaluations / f"deterministic{ending}" for _, folder in folders]
+    return [*(during[env_steps] for env_steps in sorted(during)), *(file for file in after if file.is_file())]
+
+
+def stored_flights(folder: Path) -> list[Path]:
+    """Return the files of a run's evaluation flights, the latest last; or those in a recipe's output folder."""
+    if evaluated := evaluation_files(folder, NUMBERS):
+        return evaluated
+    places = (folder, RunDirectory(folder).evaluations)
+    return [file for place in places for name in STORED if (file := place / f"{name}{NUMBERS}").is_file()]
+
+
+def evaluation_score(flight: Path) -> tuple[float, float]:
+    """Return the score of a flight's evaluation, (gates per episode, mean return); −∞ if it cannot be read."""
+    try:
+        numbers = json.loads(flight.with_name(f"{flight.name.removesuffix(NUMBERS)}.json").read_text(encoding="utf-8"))
+        return float(numbers["gates_per_episode"]), float(numbers["return_mean"])
+    except (OSError, ValueError, KeyError, TypeError):
+        return -math.inf, -math.inf
+
+
+def first_readable(files: Iterable[Path], read: Callable[[Path], T], problems: list[str]) -> tuple[Path, T] | None:
+    """Return the first of a run's evaluation files that ``read`` can, with its content; None if it can read none.
+
+    If files were skipped, ``problems`` gets a line with the run, the first of these files and the reason.
+    """
+    failures: list[tuple[Path, Exception]] = []
+    found = None
+    for file in files:
+        try:
+            found = file, read(file)
+            break
+        except (ValueError, OSError) as error:
+            failures.append((file, error))
+    if failures:
+        first, failure = failures[0]
+        more = len(failures) - 1
+        others = f" and {more} other{'s' if more > 1 else ''}" if more else ""
+        reason = textwrap.shorten(str(failure).replace(f"{first.parent}{os.sep}", ""), REASON_LETTERS).rstrip(".")
+        line = f"{RunDirectory.of(first).path.name} without {first.name}{others}: {reason}"
+        problems += [line] if line not in problems else []
+    return found
+
+
 def draw_comparison(config: PlotConfig, output: Path, runs: list[RunData], problems: list[str]) -> Drawn:
     """Write `comparison.md` and `comparison.png`, if there are variants to compare."""
     if len(group_runs(runs)) < 2:
         if runs and config.figure == "comparison":
             raise ValueError("figure=comparison: these runs have only one variant; runs= takes several paths.")
-        return Drawn([], [])
+        return [], []
     comparison = compare_variants(runs, problems, config.axis)
     (output / "comparison.md").write_text(comparison_table(comparison), encoding="utf-8")
     plot_comparison(comparison, output / "comparison.png")
-    return Drawn(["comparison.md", "comparison.png"], comparison.problems)
+    return ["comparison.md", "comparison.png"], comparison.problems
 
 
 class Entry(NamedTuple):
-    """A figure of the setting `figure`: its function and the columns that it needs."""
+    """A figure of the setting `figure`: its function, and which columns of `metrics.csv` it needs."""
 
-    draw: Callable[[PlotConfig, Path, list[RunData], list[str]], Drawn]
-    """Function of the configuration, the output folder, the runs, and the lines for what was left out of them."""
-    columns: Callable[[PlotConfig], Iterable[str]]
-    """Returns the columns of `metrics.csv` to read."""
+    draw: Callable[[PlotConfig, Path, list[RunData], list[str]], Drawn]  # the strings: what was left out of the runs
+    columns: Callable[[PlotConfig], Iterable[str]] = lambda config: ()
 
 
 FIGURES = {
     "learning_curves": Entry(draw_learning_curves, lambda config: wanted_columns(config.quantities, config.axis)),
-    "imagined": Entry(draw_imagined, lambda config: ()),
-    "trajectories": Entry(draw_trajectories, lambda config: ()),
+    "imagined": Entry(draw_imagined),
+    "trajectories": Entry(draw_trajectories),
     "comparison": Entry(draw_comparison, lambda config: COLUMNS),
 }

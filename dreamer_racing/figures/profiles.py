@@ -1,7 +1,4 @@
-"""Profiles of speed and altitude along a flight; on a map, a drone above a gate looks as if it passed the gate.
-
-Shapes: K control steps of an episode.
-"""
+"""Profiles of speed and altitude along a flight of K steps; on a map, a drone above a gate looks as if it passed it."""
 
 from __future__ import annotations
 
@@ -15,7 +12,7 @@ from matplotlib.colors import Normalize
 from matplotlib.lines import Line2D
 from matplotlib.ticker import MaxNLocator
 
-from dreamer_racing.envs.tracks import Gate, Track
+from dreamer_racing.envs.tracks import Track
 from dreamer_racing.evaluation.trajectory import Trajectory
 from dreamer_racing.figures.drawing import CRASH, DASHED, FAINT, GATE_COLOR, MUTED, SPEED_COLORS, Style, dress
 
@@ -29,12 +26,9 @@ HEADROOM = 0.3  # m above the highest thing drawn
 class Crossing(NamedTuple):
     """A crossing of a race gate's bar by a flight, seen from above."""
 
-    row: float
-    """Fractional row of the trajectory: 0.5 is halfway between the first two rows."""
-    gate: int
-    """Index of the gate on the track."""
-    passed: bool
-    """Whether the race counted a pass: through the opening, in order, forwards."""
+    row: float  # fractional row of the trajectory: 0.5 is halfway between the first two rows
+    gate: int  # index on the track
+    passed: bool  # whether the race counted it: through the opening, in order, forwards
 
 
 def crossings(track: Track, trajectory: Trajectory) -> list[Crossing]:
@@ -42,19 +36,14 @@ def crossings(track: Track, trajectory: Trajectory) -> list[Crossing]:
     found = []
     target = trajectory.target_gate.numpy()
     for index, gate in enumerate(track.gates):
-        rows = _rows_of_crossing(gate, track.shape.outer / 2, trajectory.position.numpy())
+        offset = trajectory.position.numpy()[:, :2] - np.array(gate.position[:2])
+        along, side = offset @ np.array(gate.forward[:2]), offset @ np.array(gate.left[:2])  # (K + 1,)
+        steps = np.flatnonzero((along[:-1] < 0) != (along[1:] < 0))
+        share = along[steps] / (along[steps] - along[steps + 1])
+        across = side[steps] + share * (side[steps + 1] - side[steps])
+        rows = (steps + share)[np.abs(across) <= track.shape.outer / 2].tolist()
         found += [Crossing(row, index, bool(target[int(row)] == index != target[int(row) + 1])) for row in rows]
     return sorted(found)
-
-
-def _rows_of_crossing(gate: Gate, reach: float, position: np.ndarray) -> list[float]:
-    """Return the fractional rows of (K + 1, 3) that cross a gate's plane within ``reach`` m to either side."""
-    offset = position[:, :2] - np.array(gate.position[:2])
-    along, side = offset @ np.array(gate.forward[:2]), offset @ np.array(gate.left[:2])  # (K + 1,)
-    steps = np.flatnonzero((along[:-1] < 0) != (along[1:] < 0))
-    share = along[steps] / (along[steps] - along[steps + 1])
-    across = side[steps] + share * (side[steps + 1] - side[steps])
-    return [float(row) for row in (steps + share)[np.abs(across) <= reach]]
 
 
 def profile_axis(trajectory: Trajectory, over: str) -> np.ndarray:
@@ -76,10 +65,7 @@ def draw_speed(axes: Axes, trajectory: Trajectory, speed: Normalize, over: str =
 def draw_altitude(
     axes: Axes, track: Track, trajectory: Trajectory, speed: Normalize, over: str = "distance", numbers: bool = True
 ) -> None:
-    """Draw the altitude, coloured by speed, and a gate's frame at every crossing of its bar on the map.
-
-    The gap in a frame is the opening. Frames of crossings that did not count as a pass are grey.
-    """
+    """Draw the altitude, coloured by speed, and a gate's frame where its bar on the map is crossed, grey if missed."""
     along = profile_axis(trajectory, over)
     height = trajectory.position[:, 2].numpy()
     _draw_profile(axes, trajectory, along, height, speed)
@@ -128,7 +114,6 @@ def _draw_profile(axes: Axes, trajectory: Trajectory, along: np.ndarray, values:
 
 
 def _number_passes(axes: Axes, trajectory: Trajectory, along: np.ndarray) -> None:
-    """Draw a numbered line at every gate pass."""
     for row in np.flatnonzero(np.diff(trajectory.target_gate)):
         place, number = along[row + 1], str(int(trajectory.target_gate[row]) + 1)
         axes.axvline(place, color=FAINT, linewidth=0.8, linestyle=(0, (2, 2)), zorder=1)

@@ -62,10 +62,7 @@ def share_bar(happened: Sequence[bool]) -> Bar:
 
 
 def mean_bar(values: Sequence[float], height: float | None = None) -> Bar:
-    """Return the mean of independent non-negative values with its normal interval.
-
-    Give another ``height`` of the bar where values are means over samples of different length.
-    """
+    """Return the mean of independent non-negative values, or another ``height``, with the mean's normal interval."""
     n, mean = len(values), float(np.mean(values)) if height is None else height
     half = Z95 * float(np.std(values, ddof=1)) / np.sqrt(n) if n > 1 else 0.0
     return Bar(mean, max(0.0, mean - half), mean + half, n)
@@ -74,10 +71,11 @@ def mean_bar(values: Sequence[float], height: float | None = None) -> Bar:
 def write_markdown(directory: Path, results: Sequence[Result], provenance: dict[str, Any]) -> None:
     """Write evaluation.md, the table of conditions, with its plots."""
     title = f"{provenance['algorithm']} on {provenance['track']}, {provenance['env_steps']:,} env_steps"
-    plot_conditions(results, RunDirectory(directory).plots / "conditions.png", title)
+    into = RunDirectory(directory).plots
+    plot_conditions(results, into / "conditions.png", title)
     for preset in dict.fromkeys(result.preset for result in results):
         flown = {r.mode: r.evaluation for r in results if r.preset == preset and r.condition == "nominal"}
-        plot_crashes(flown, RunDirectory(directory).plots / f"crashes_{preset}.png", f"{title}, nominal, {preset}")
+        plot_crashes(flown, into / f"crashes_{preset}.png", f"{title}, nominal, {preset}")
     meanings = "\n".join(f"- `{condition.name}`: {condition.meaning}" for condition in CONDITIONS)
     plots = "\n\n".join(f"![{name}](plots/{name}.png)" for name in ("conditions", *(f"crashes_{p}" for p in PRESETS)))
     text = f"{report_heading(title, provenance)}\n{results_table(results)}\n{meanings}\n\n{plots}\n"
@@ -89,14 +87,16 @@ def plot_conditions(results: Sequence[Result], path: str | Path, title: str) -> 
     places = list(dict.fromkeys((result.preset, result.condition) for result in results))
     figure = Figure(figsize=(max(9.0, 1.2 * len(places)), 6.4), layout="constrained")
     success, gates = figure.subplots(2, 1, sharex=True)
-    panels = ((success, "Success", _success, "{:.0%}"), (gates, "Gates per episode", _gates, "{:.2f}"))
-    for axes, name, measure, form in panels:
-        for index, mode in enumerate(MODES):
-            bars = {(r.preset, r.condition): measure(r.evaluation) for r in results if r.mode == mode}
-            at = [number + (index - 0.5) * 0.4 for number, place in enumerate(places) if place in bars]
-            shown = [bars[place] for place in places if place in bars]
-            _draw_bars(axes, np.array(at), shown, MODE_COLORS[mode], mode, form)
-        _dress(axes, name)
+    for index, mode in enumerate(MODES):
+        flown = {(r.preset, r.condition): _distinct(r.evaluation) for r in results if r.mode == mode}
+        at = np.array([number + (index - 0.5) * 0.4 for number, place in enumerate(places) if place in flown])
+        shown = [flown[place] for place in places if place in flown]
+        finished = [share_bar([episode.outcome == FINISHED for episode in episodes]) for episodes in shown]
+        passed = [mean_bar([episode.gates_passed for episode in episodes]) for episodes in shown]
+        _draw_bars(success, at, finished, MODE_COLORS[mode], mode, "{:.0%}")
+        _draw_bars(gates, at, passed, MODE_COLORS[mode], mode, "{:.2f}")
+    _dress(success, "Success")
+    _dress(gates, "Gates per episode")
     _share_axis(success)
     from_zero(gates)
     gates.set_ylim(top=1.25 * gates.get_ylim()[1])
@@ -106,14 +106,6 @@ def plot_conditions(results: Sequence[Result], path: str | Path, title: str) -> 
     note = "Lines: 95 % intervals over n different flights (success: Wilson, mean gates: normal)."
     figure.supxlabel(note, x=0.01, ha="left", fontsize=8, color=MUTED)
     _save(figure, path, title)
-
-
-def _success(evaluation: Evaluation) -> Bar:
-    return share_bar([episode.outcome == FINISHED for episode in _distinct(evaluation)])
-
-
-def _gates(evaluation: Evaluation) -> Bar:
-    return mean_bar([episode.gates_passed for episode in _distinct(evaluation)])
 
 
 def _distinct(evaluation: Evaluation) -> list[Episode]:
@@ -149,10 +141,7 @@ def plot_crashes(flown: Mapping[str, Evaluation], path: str | Path, title: str) 
 
 
 def plot_sight(flights: Flights, camera: Camera, path: str | Path, title: str) -> None:
-    """Draw where the camera pointed: flights from above, distributions of angles, and shares of time in view.
-
-    The tracks have one size.
-    """
+    """Draw where the camera pointed, on tracks of one size: flights from above, angles, and shares of time in view."""
     columns, track = len(flights), next(iter(flights.values()))[0]
     width, depth = (high - low for low, high in zip(track.bounds_low[:2], track.bounds_high[:2], strict=True))
     map_height = min(6.5, 8.5 / columns * depth / width)

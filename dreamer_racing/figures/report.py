@@ -1,7 +1,4 @@
-"""Reports of evaluations: numbers, a plot of the flight, and films, of a world model's predictions and from outside.
-
-Shapes: K control steps of a recorded episode.
-"""
+"""Reports of evaluations: numbers, a plot of the flight, and films, of a world model's predictions and from outside."""
 
 import json
 import math
@@ -26,15 +23,19 @@ from dreamer_racing.evaluation.trajectory import write_flight
 from dreamer_racing.figures.film import (
     GAP,
     GIF_SIZE,
+    caption,
+    dream_words,
     enlarge,
     enlarge_to_watch,
     onboard_beside_map,
+    race_words,
+    second_lap,
     side_by_side,
+    slow_motion,
     write_gif,
     write_video,
 )
-from dreamer_racing.figures.hud import caption, dream_words, race_words, second_lap, slow_motion
-from dreamer_racing.figures.top_down import plot_top_down
+from dreamer_racing.figures.flights import plot_top_down
 from dreamer_racing.learners.learner import Evaluable
 from dreamer_racing.learners.update import WorldModelLearner
 from dreamer_racing.training.directory import EVALUATION, RunDirectory
@@ -47,14 +48,8 @@ SEEN_STEPS, DREAMT_STEPS = 10, 40  # control steps observed by the model, then p
 class EvaluationReport:
     """Evaluates a learner's policy and writes numbers, plot and video into the run directory.
 
-    Args:
-        directory: the run directory; files go to its `plots`, `videos` and `evaluations` folders.
-        learner: the learner with the policy and, if any, the world model.
-        worlds: arguments of `DroneRacingEnv`: track, preset, renderer, camera.
-        episodes: number of episodes per evaluation.
-        video_steps: maximum control steps in the video.
-        num_envs: see `Course`.
-        seed: seed of the environment, set before each evaluation, so that all have the same starts and drones.
+    ``worlds`` are arguments of `DroneRacingEnv`: track, preset, renderer, camera. The environment is seeded before each
+    evaluation, so that all have the same starts and drones. The video has at most ``video_steps`` control steps.
     """
 
     def __init__(
@@ -76,10 +71,9 @@ class EvaluationReport:
         self._course = Course(learner.evaluation_policy(), {**worlds, "seed": seed}, episodes, num_envs)
 
     def make(self, env_steps: int, stochastic: bool = False) -> dict[str, float]:
-        """Evaluate the deterministic policy, and optionally the stochastic one; write all files.
+        """Evaluate the deterministic policy and, if ``stochastic``, the stochastic one; write all files.
 
-        Returns:
-            Metrics `evaluation/...`, and `evaluation_stochastic/...` if ``stochastic``.
+        Returns metrics `evaluation/...` and `evaluation_stochastic/...`.
         """
         metrics: dict[str, float] = {}
         for suffix in ("", "_stochastic") if stochastic else ("",):
@@ -124,12 +118,12 @@ class EvaluationReport:
         if painter is None or not isinstance(self._learner, WorldModelLearner):
             frames, right = enlarge_to_watch(trajectory.pixels[:count].numpy()), list[str]()
         else:
-            frames = dream_beside_flight(self._learner, trajectory, painter, count).numpy()
+            frames = dream_beside_flight(self._learner, trajectory, painter, count)
             right = dream_words(count, SEEN_STEPS, trajectory.control_dt, SEEN_STEPS + DREAMT_STEPS)
         slower = slow_motion(count * trajectory.control_dt)
         slowed = f"  {slower}x slower" if slower > 1 else ""
         left = [words + slowed for words in race_words(self._course.base.track, trajectory)[:count]]
-        write_video(path, caption(frames, left, right), fps=1 / (slower * trajectory.control_dt), scale=1)
+        write_video(path, caption(frames, left, right), fps=1 / (slower * trajectory.control_dt))
 
     def close(self) -> None:
         """Close the evaluation's simulator."""
@@ -139,13 +133,8 @@ class EvaluationReport:
 class ReturnReport:
     """Evaluates a learner's policy in any environment by its returns, and records a video of one episode.
 
-    Args:
-        directory: the run directory; files go to its `videos` and `evaluations` folders.
-        learner: the learner with the policy.
-        env: environment of batch size [N], with `pixels` or `vector`.
-        episodes: number of episodes per evaluation, assigned to the N environments beforehand.
-        video_steps: maximum number of steps in the video.
-        seed: set before each evaluation: all have the same starts, even after resuming.
+    The environment has batch size [N], with `pixels` or `vector`; episodes are assigned to the N environments
+    beforehand. It is seeded before each evaluation, so that all have the same starts, even after resuming.
     """
 
     def __init__(
@@ -168,11 +157,7 @@ class ReturnReport:
         self._seed = seed
 
     def make(self, env_steps: int, stochastic: bool = False) -> dict[str, float]:
-        """Evaluate the deterministic policy, and optionally the stochastic one; write all files.
-
-        Returns:
-            Metrics `evaluation/...`, and `evaluation_stochastic/...` if ``stochastic``.
-        """
+        """Evaluate and write as `EvaluationReport.make`."""
         metrics: dict[str, float] = {}
         for suffix in ("", "_stochastic") if stochastic else ("",):
             self._policy.deterministic = not suffix
@@ -218,28 +203,26 @@ class ReturnReport:
             folder.mkdir(parents=True, exist_ok=True)
         (into.evaluations / f"{name}.json").write_text(json.dumps(numbers, indent=2))
         if frames:
-            write_video(into.videos / f"{name}.mp4", torch.stack(frames), fps=30)
+            write_video(into.videos / f"{name}.mp4", enlarge_to_watch(torch.stack(frames).cpu().numpy()), fps=30)
 
     def close(self) -> None:
         """Close the evaluation's environments."""
         self._env.close(raise_if_closed=False)
 
 
-def dream_beside_flight(learner: WorldModelLearner, trajectory: Trajectory, painter: Painter, max_steps: int) -> Tensor:
-    """Compose the on-board view and the world model's prediction, alternating between context and open loop.
+def dream_beside_flight(learner: WorldModelLearner, trajectory: Trajectory, painter: Painter, steps: int) -> np.ndarray:
+    """Compose on-board view | the world model's prediction, alternating between context and open loop.
 
-    Returns:
-        uint8 frames (T, height, width, 3), at most ``max_steps`` of them.
+    Returns uint8 frames (steps, height, width, 3).
     """
     assert trajectory.pixels is not None
-    pixels = trajectory.pixels[:max_steps]
     shown = []
-    for start in range(0, len(pixels), SEEN_STEPS + DREAMT_STEPS):
-        part = slice(start, min(start + SEEN_STEPS + DREAMT_STEPS, len(pixels)))
+    for start in range(0, steps, SEEN_STEPS + DREAMT_STEPS):
+        part = slice(start, min(start + SEEN_STEPS + DREAMT_STEPS, steps))
         seen = min(SEEN_STEPS, part.stop - start)
         dreamt = dream(learner, trajectory, painter, part, seen)
-        shown.append(torch.as_tensor(side_by_side(pixels[part], dreamt, seen)))
-    return torch.cat(shown)
+        shown.append(side_by_side(trajectory.pixels[part], dreamt, seen))
+    return np.concatenate(shown)
 
 
 def report_condition(into: RunDirectory, result: Result, video_steps: int) -> None:
@@ -265,7 +248,7 @@ def report_flight(directory: Path, track: Track, result: Evaluation) -> str:
         return f"{files} (there is no video: the agent sees numbers)"
     words = race_words(track, trajectory)
     film = caption(enlarge_to_watch(trajectory.pixels.numpy()), words)
-    filmed = write_video(directory / "onboard.mp4", film, fps=1 / trajectory.control_dt, scale=1)
+    filmed = write_video(directory / "onboard.mp4", film, fps=1 / trajectory.control_dt)
     first, last = second_lap(trajectory)
     frames = onboard_beside_map(track, trajectory.part(first, last), GIF_SIZE)[::GIF_STRIDE]
     gif = caption(frames, words[first : last + 1 : GIF_STRIDE])
@@ -277,7 +260,7 @@ def film_from_outside(directory: Path, view: ChaseView, track: Track, trajectory
     """Write a video of the whole flight and a GIF of its second lap, from outside and by the drone; name the files."""
     frames, words = chase_beside_onboard(view, trajectory), race_words(track, trajectory)
     view.close()
-    filmed = write_video(directory / "chase.mp4", caption(frames, words), fps=1 / trajectory.control_dt, scale=1)
+    filmed = write_video(directory / "chase.mp4", caption(frames, words), fps=1 / trajectory.control_dt)
     first, last = second_lap(trajectory)
     shown = slice(first, last + 1, CHASE_STRIDE)
     gif, fps = caption(frames[shown], words[shown]), 1 / (CHASE_STRIDE * trajectory.control_dt)
@@ -286,12 +269,14 @@ def film_from_outside(directory: Path, view: ChaseView, track: Track, trajectory
 
 
 def chase_beside_onboard(view: ChaseView, trajectory: Trajectory) -> np.ndarray:
-    """Compose chase view | on-board view, or the chase view alone if there are no images.
+    """Compose chase view | on-board view, (K + 1, size, size + `GAP` + width, 3), or without images the chase view.
 
-    Returns:
-        (K + 1, size, size + `GAP` + width, 3) uint8. On-board images are scaled by an integer factor and centred.
+    On-board images are scaled by an integer factor and centred.
     """
-    outside = _chase_frames(view, trajectory)
+    position, attitude = trajectory.position.double().numpy(), trajectory.attitude.double().numpy()
+    gate, time = trajectory.target_gate.numpy(), trajectory.control_dt * np.arange(len(position))
+    rows = (slice(row, row + 1) for row in range(len(position)))
+    outside = np.concatenate([view.draw(position[row], attitude[row], gate[row], time[row]) for row in rows])
     if trajectory.pixels is None:
         return outside
     height = outside.shape[1]
@@ -301,11 +286,3 @@ def chase_beside_onboard(view: ChaseView, trajectory: Trajectory) -> np.ndarray:
     missing = height - seen.shape[1]
     seen = np.pad(seen, ((0, 0), (missing // 2, missing - missing // 2), (GAP, 0), (0, 0)), constant_values=255)
     return np.concatenate((outside, seen), axis=2)
-
-
-def _chase_frames(view: ChaseView, trajectory: Trajectory) -> np.ndarray:
-    """Render a flight from the chase camera, (K + 1, size, size, 3) uint8."""
-    position, attitude = trajectory.position.double().numpy(), trajectory.attitude.double().numpy()
-    gate, time = trajectory.target_gate.numpy(), trajectory.control_dt * np.arange(len(position))
-    rows = (slice(row, row + 1) for row in range(len(position)))
-    return np.concatenate([view.draw(position[row], attitude[row], gate[row], time[row]) for row in rows])

@@ -7,7 +7,7 @@ import hashlib
 import os
 import re
 from collections import defaultdict
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 from itertools import combinations, groupby, pairwise
@@ -41,10 +41,8 @@ class Axis(NamedTuple):
     """The axis along which curves are drawn and runs compared."""
 
     label: str
-    clock: str | None
-    """Column of `metrics.csv` with the clock in s since the run began; None for the axis env_steps."""
-    form: str
-    """Format of numbers on the axis."""
+    clock: str | None  # column of `metrics.csv` with the clock in s since the run began; None for env_steps
+    form: str  # format of numbers on the axis
     smallest_window: float
 
 
@@ -56,11 +54,7 @@ AXES = {
 
 
 def axis_of(name: str) -> Axis:
-    """Return the axis of a name.
-
-    Raises:
-        ValueError: the name is unknown.
-    """
+    """Return the axis of a name; raise ValueError if it is unknown."""
     check_choice("axis", name, AXES)
     return AXES[name]
 
@@ -87,17 +81,14 @@ class CurveKey(NamedTuple):
 class RunData:
     """Content of a run directory, or of a metrics table that was kept without one."""
 
-    directory: Path
-    """The run directory, or the file of the metrics table."""
-    config: dict[str, Any]
-    """Settings of `config.yaml` by dotted name; empty for a metrics table."""
+    directory: Path  # or the file of the metrics table
+    config: dict[str, Any]  # settings of `config.yaml` by dotted name; empty for a metrics table
     metrics: MetricsTable
-    overrides: dict[str, str] = field(default_factory=dict)
-    """Settings of the command line as text, by dotted name; empty if they were not stored."""
+    overrides: dict[str, str] = field(default_factory=dict)  # settings of the command line, if they were stored
 
     @property
     def name(self) -> str:
-        """Name of the folder or file."""
+        """Name of the folder or file, for messages."""
         return self.directory.name
 
     @property
@@ -143,11 +134,8 @@ def _key_of_table(path: Path) -> CurveKey:
 def find_runs(places: Sequence[str | Path]) -> list[Path]:
     """Find run directories (folders with `config.yaml` or `metrics.csv`) and metrics tables `metrics_<name>.csv`.
 
-    Args:
-        places: run directories, tables, folders that contain them at any depth, or glob patterns of these.
-
-    Returns:
-        The folders and tables, sorted, without duplicates. Folders inside a run (`best`, `evaluation`) are no runs.
+    Places are run directories, tables, folders that contain them at any depth, or glob patterns of these. What is found
+    is sorted, without duplicates. Folders inside a run (`best`, `evaluation`) are no runs.
 
     Raises:
         ValueError: one of the places has no run.
@@ -179,12 +167,9 @@ def runs_below(folder: Path) -> Iterator[Path]:
 
 
 def read_runs(directories: Sequence[Path], wanted: Collection[str] | None = None) -> tuple[list[RunData], list[str]]:
-    """Read runs without unreadable ones; of runs with the same settings and seed, keep the one with most env_steps.
+    """Read runs, and return them with a line for everything left out; of `metrics.csv` read the ``wanted`` columns.
 
-    Reads the ``wanted`` columns of `metrics.csv`, None for all.
-
-    Returns:
-        The runs, and a line with run and reason for everything left out.
+    Unreadable runs are left out; of runs with the same settings and seed, the one with most env_steps is kept.
     """
     runs, problems = [], []
     for directory in directories:
@@ -255,9 +240,8 @@ def flatten(config: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, 
 def group_runs(runs: Sequence[RunData]) -> dict[CurveKey, list[RunData]]:
     """Group runs by curve, sorted by seed.
 
-    Runs of one algorithm, track and named variant whose settings differ in more than `SAME_CURVE` form separate curves.
-    Their variants name the overrides that differ, or else the settings. A setting that a run lacks, because an older
-    version started it, is not a difference.
+    Runs of one algorithm, track and named variant whose settings differ in more than `SAME_CURVE` form separate curves,
+    whose variants name the overrides that differ, or else the settings. What a run lacks is not a difference.
 
     Raises:
         ValueError: two runs of one curve have the same seed.
@@ -274,11 +258,7 @@ def group_runs(runs: Sequence[RunData]) -> dict[CurveKey, list[RunData]]:
 
 
 def along(runs: Sequence[RunData], axis: str) -> tuple[list[RunData], list[str]]:
-    """Replace env_steps in the tables of runs by positions on another axis.
-
-    Returns:
-        The runs, and a line for each run that is left out because it lacks the axis's clock.
-    """
+    """Replace env_steps in the tables of runs by positions on another axis; return a line for each run without it."""
     clock = axis_of(axis).clock
     if clock is None:
         return list(runs), []
@@ -287,15 +267,11 @@ def along(runs: Sequence[RunData], axis: str) -> tuple[list[RunData], list[str]]
         if clock not in run.metrics.columns:
             problems.append(f"{run.name} left out: it has no {clock}, which axis={axis} needs")
             continue
-        hours = partial(_hours, *run.metrics.columns[clock])
+        clock_steps, seconds = run.metrics.columns[clock]
+        hours: Callable[..., Any] = partial(np.interp, xp=clock_steps, fp=seconds / 3600.0)
         columns = {name: (hours(steps), values) for name, (steps, values) in run.metrics.columns.items()}
         kept.append(replace(run, metrics=replace(run.metrics, columns=columns, env_steps=hours(run.metrics.env_steps))))
     return kept, problems
-
-
-def _hours(steps: np.ndarray, seconds: np.ndarray, env_steps: np.ndarray) -> np.ndarray:
-    """Convert env_steps to hours, by linear interpolation of a clock."""
-    return np.interp(env_steps, steps, seconds / 3600.0)
 
 
 def first_of_each_curve(runs: Sequence[RunData]) -> list[RunData]:

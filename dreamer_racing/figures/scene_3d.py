@@ -1,7 +1,4 @@
-"""3-D scene of a race in a browser, with viser: track, paths, and drones with their camera images.
-
-Shapes: K control steps of an episode; F flights shown together.
-"""
+"""3-D scene of a race in a browser, with viser: track, paths, and drones with their camera images."""
 
 from __future__ import annotations
 
@@ -35,7 +32,7 @@ VIEW_ANGLE = 50.0  # degrees, vertical
 
 
 def check_viser() -> None:
-    """Raise ValueError if viser is not installed; the message names the extra that installs it."""
+    """Raise ValueError if viser is not installed."""
     if importlib.util.find_spec("viser") is None:
         raise ValueError(f"The dashboard needs the package viser: {install_extra('dashboard')}.")
 
@@ -44,19 +41,15 @@ def check_viser() -> None:
 class Paint:
     """Colours of a flight."""
 
-    color: str
-    """Colour of the drone and of its curves."""
-    speeds: Colormap
-    """Colours of the path, from zero to the highest speed of all flights shown."""
+    color: str  # of the drone and of its curves
+    speeds: Colormap  # of the path, from zero to the highest speed of all flights shown
 
 
 ALONE = Paint("#1971c2", SPEED_COLORS)
-"""Colours of a flight that is shown alone."""
-SIDE_BY_SIDE = (
+SIDE_BY_SIDE = (  # bright is fast
     Paint("#1971c2", LinearSegmentedColormap.from_list("blue", ["#0b2f57", "#1971c2", "#99d3ff"])),
     Paint("#ae3ec9", LinearSegmentedColormap.from_list("violet", ["#4a1259", "#ae3ec9", "#f1b8ff"])),
 )
-"""Colours of the two flights of a comparison; bright is fast."""
 
 
 def paints(flights: int) -> tuple[Paint, ...]:

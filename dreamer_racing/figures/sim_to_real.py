@@ -23,10 +23,8 @@ LABELS = {
     "rate": ("poses a second (Hz)", 1.0),
 }
 """Axis label of each sweep, and the factor from its values to the label's unit."""
-
 COLORS = ("#2f5fb3", "#e8590c", "#1fa2a6", "#7950f2")
-APART = 0.16
-"""Horizontal offset between studies at one value, as a share of the step between values, against overlap."""
+APART = 0.16  # horizontal offset between studies at one value, as a share of the step between values, against overlap
 NOTE = "Lines: 95 % intervals over n flights (success: Wilson, mean laps: normal). Horizontal axes are not to scale."
 
 
@@ -61,22 +59,15 @@ def _draw_sweep(column: np.ndarray, sweep: str, results: Sequence[Mapping[str, A
         made = result["provenance"]
         label = f"{made['actor']} on {made['track']}, {made['preset']}"
         by_value = [[flight for flight in flights if flight["value"] == value] for value in values]
+        laps = [[one["lap_time"] for one in group if one["lap_time"] is not None] for group in by_value]
+        success = [share_bar([one["finished"] for one in group]) if group else None for group in by_value]
         shift = APART * (number - 0.5 * (len(results) - 1))
-        for axes, bar_of in zip(column, (_success, _laps), strict=True):
-            _draw_bars(axes, shift, [bar_of(group) for group in by_value], color, label)
+        _draw_bars(column[0], shift, success, color, label)
+        _draw_bars(column[1], shift, [mean_bar(times) if times else None for times in laps], color, label)
     label, unit = LABELS[sweep]
     column[1].set_xlabel(label)
     column[1].set_xticks(range(len(values)), [f"{unit * value:g}" for value in values])
     column[1].set_xlim(-0.6, len(values) - 0.4)
-
-
-def _success(flights: Sequence[Mapping[str, Any]]) -> Bar | None:
-    return share_bar([flight["finished"] for flight in flights]) if flights else None
-
-
-def _laps(flights: Sequence[Mapping[str, Any]]) -> Bar | None:
-    laps = [flight["lap_time"] for flight in flights if flight["lap_time"] is not None]
-    return mean_bar(laps) if laps else None
 
 
 def _draw_bars(axes: Axes, shift: float, bars: Sequence[Bar | None], color: str, label: str) -> None:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import csv
+from collections.abc import Iterable
 from pathlib import Path
 
 import numpy as np
@@ -18,7 +20,7 @@ from dreamer_racing.figures.curves import (
     weight_raises,
     write_curves,
 )
-from dreamer_racing.figures.evaluations import evaluation_files, evaluation_score
+from dreamer_racing.figures.plotting import evaluation_files, evaluation_score
 from dreamer_racing.figures.runs import CurveKey, find_runs, first_of_each_curve, group_runs, read_runs
 from dreamer_racing.training.metrics import read_metrics
 
@@ -29,8 +31,14 @@ def write_run(folder: Path, name: str, returns=(0.0, 10.0), track: str = "circle
     run.mkdir(parents=True)
     config = {"track": track, "seed": 0, "run_dir": str(run), "env": {"preset": "easy"}} | settings
     (run / "config.yaml").write_text(yaml.safe_dump(config))
-    rows = [f"{1000 * (i + 1)},{value},{value / 100}\n" for i, value in enumerate(returns)]
-    (run / "metrics.csv").write_text("env_steps,episode/return,evaluation/success_rate\n" + "".join(rows))
+    rows = [(1000 * (i + 1), value, value / 100) for i, value in enumerate(returns)]
+    return write_metrics(run, ["episode/return", "evaluation/success_rate"], rows)
+
+
+def write_metrics(run: Path, columns: list[str], rows: Iterable[tuple]) -> Path:
+    """Replace the metrics of a run; a row begins with env_steps, and None is an empty cell."""
+    with (run / "metrics.csv").open("w", newline="") as file:
+        csv.writer(file, lineterminator="\n").writerows([["env_steps", *columns], *rows])
     return run
 
 
@@ -89,10 +97,8 @@ def test_a_seed_that_ends_early_is_named_and_a_single_one_has_no_band(tmp_path, 
 def write_laps(folder: Path, seed: int, laps: list[float | None]) -> Path:
     """A run with an evaluation after 1000, 2000 ... env_steps, some without a lap."""
     run = write_run(folder, f"ppo_circle_seed{seed}", algorithm="ppo", seed=seed)
-    rows = [f"{1000 * (i + 1)},20,{'' if lap is None else lap}\n" for i, lap in enumerate(laps)]
-    rows = [row for i, line in enumerate(rows) for row in (f"{1000 * i + 500},,\n", line)]  # and rows of training
-    (run / "metrics.csv").write_text("env_steps,evaluation/num_episodes,evaluation/lap_time_mean\n" + "".join(rows))
-    return run
+    rows = [row for i, lap in enumerate(laps) for row in ((1000 * i + 500, None, None), (1000 * (i + 1), 20, lap))]
+    return write_metrics(run, ["evaluation/num_episodes", "evaluation/lap_time_mean"], rows)  # with rows of training
 
 
 def test_no_lap_is_drawn_where_none_was_flown(tmp_path):
@@ -124,17 +130,15 @@ def test_laps_of_fewer_than_half_of_the_seeds_are_not_drawn(tmp_path):
 def test_a_seed_that_never_flew_a_lap_counts_as_one_without(tmp_path):
     write_laps(tmp_path, 0, [None, 6.0])
     for seed in (1, 2):
-        run = write_laps(tmp_path, seed, [None, None])
-        (run / "metrics.csv").write_text("env_steps,evaluation/num_episodes\n1000,20\n2000,20\n")
+        write_metrics(write_laps(tmp_path, seed, []), ["evaluation/num_episodes"], [(1000, 20), (2000, 20)])
     result = curves_of(tmp_path, quantities=["lap_time"])
     assert np.isnan(result.curves[0].centre).all() and result.curves[0].seeds.max() == 1
     assert "no values of evaluation/lap_time_mean: ppo_circle_seed1, ppo_circle_seed2" in result.problems
 
 
 def test_the_stochastic_policy_can_be_drawn(tmp_path):
-    run = write_run(tmp_path, "ppo_circle_seed0", algorithm="ppo")
-    columns = "evaluation_stochastic/success_rate,evaluation_stochastic/gates_per_episode"
-    (run / "metrics.csv").write_text(f"env_steps,{columns}\n1000,0.5,7\n2000,0.5,7\n")
+    columns = ["evaluation_stochastic/success_rate", "evaluation_stochastic/gates_per_episode"]
+    write_metrics(write_run(tmp_path, "ppo_circle_seed0"), columns, [(1000, 0.5, 7), (2000, 0.5, 7)])
     rate, gates = curves_of(tmp_path, quantities=["stochastic_success_rate", "stochastic_gates"]).curves
     assert (rate.centre[-1], gates.centre[-1]) == (0.5, 7.0)
 
@@ -167,8 +171,7 @@ def test_iqm_pools_tracks_only_where_values_are_comparable(tmp_path):
 def test_a_raise_is_a_whole_increment(tmp_path):
     run = write_run(tmp_path, "run", [], curriculum={"increment": 0.001})
     weights = [0, 0, 0.0005, 0.001, 0.001, 0.0017, 0.003, 0.003]  # rows between two levels are means of both
-    lines = [f"{1000 * i},{weight:.8g}\n" for i, weight in enumerate(weights)]
-    (run / "metrics.csv").write_text("env_steps,curriculum/body_rate_weight\n" + "".join(lines))
+    write_metrics(run, ["curriculum/body_rate_weight"], [(1000 * i, weight) for i, weight in enumerate(weights)])
     ((data,), _) = read_runs([run])
     np.testing.assert_array_equal(weight_raises(data), [3000, 6000])
 
@@ -199,10 +202,8 @@ def test_curves_survive_their_file(tmp_path, window):
 def write_timed_run(folder: Path, name: str, values, seconds, **settings) -> Path:
     """A run whose return has these values after 1000, 2000 ... env_steps, and its clock these readings."""
     run = write_run(folder, name, values, **settings)
-    rows = zip(values, seconds, strict=True)
-    lines = [f"{1000 * (i + 1)},{value},{clock},{clock / 2}\n" for i, (value, clock) in enumerate(rows)]
-    (run / "metrics.csv").write_text("env_steps,episode/return,wall_clock,cpu_clock\n" + "".join(lines))
-    return run
+    rows = [(1000 * (i + 1), values[i], clock, clock / 2) for i, clock in enumerate(seconds)]
+    return write_metrics(run, ["episode/return", "wall_clock", "cpu_clock"], rows)
 
 
 @pytest.mark.parametrize(("axis", "longest"), [("hours", 4.0), ("core_hours", 2.0)])
@@ -407,9 +408,8 @@ def test_evaluations_by_env_steps_then_those_after_training(tmp_path):
     folder.mkdir()
     for name in ("000000200", "000000100", "000000100_stochastic"):
         (folder / f"{name}_trajectory.csv").touch()
-    after = [
-        tmp_path / name / "evaluations" for name in ("evaluation", "evaluation_2", "evaluation_10", "evaluation_x")
-    ]
+    names = ("evaluation", "evaluation_2", "evaluation_10", "evaluation_x")
+    after = [tmp_path / name / "evaluations" for name in names]
     for place in after:
         place.mkdir(parents=True)
         (place / "deterministic_trajectory.csv").touch()

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
-from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
@@ -21,10 +20,9 @@ from dreamer_racing.evaluation.trajectory import (
     write_flight,
     write_trajectory,
 )
-from dreamer_racing.figures.drawing import CRASH_COLOR, GATE_COLOR, left_out_of, speed_scale
-from dreamer_racing.figures.film import CONTEXT_COLOR, OPEN_LOOP_COLOR, film_strip, shown_frames
+from dreamer_racing.figures.drawing import CRASH_COLOR, GATE_COLOR, speed_scale
+from dreamer_racing.figures.film import CONTEXT_COLOR, OPEN_LOOP_COLOR, dream_video, film_strip, shown_frames
 from dreamer_racing.figures.flights import NamedFlight, plot_dreams, plot_flights
-from dreamer_racing.figures.hud import dream_video
 from dreamer_racing.figures.profiles import MISSED_COLOR, Crossing, crossings, draw_altitude, profile_axis
 
 
@@ -259,15 +257,13 @@ def test_axis_of_the_profiles():
     flight.position[:] = torch.tensor([[0.0, 0, 0], [3, 4, 0], [3, 4, 12]])
     np.testing.assert_allclose(profile_axis(flight, "distance"), [0, 5, 17])
     np.testing.assert_allclose(profile_axis(flight, "time"), [0, 0.02, 0.04])
-    with pytest.raises(ValueError, match="over=height: must be one of distance, time"):
-        plot_flights([NamedFlight("a", load_track("circle"), flight)], Path("a.png"), over="height")
 
 
 def test_what_was_left_out_is_written_beside_a_figure_and_not_into_it(tmp_path, figures):
     flight = NamedFlight("lost", load_track("split_s"), random_flight())
-    path = tmp_path / "flights.png"
+    path, left_out = tmp_path / "flights.png", tmp_path / "flights_left_out.txt"
     plot_flights([flight], path, problems=["a_run without its last flight", "b_run: ½"])
-    assert left_out_of(path).read_text(encoding="utf-8") == "a_run without its last flight\nb_run: ½\n"
+    assert left_out.read_text(encoding="utf-8") == "a_run without its last flight\nb_run: ½\n"
     assert figures[0].get_suptitle() == ""
     plot_flights([flight], path)
-    assert not left_out_of(path).exists()
+    assert not left_out.exists()

@@ -135,12 +135,17 @@ def unseen(monkeypatch: pytest.MonkeyPatch) -> None:
     draw_nothing(monkeypatch)
 
 
+def reported(folder: Path) -> dict[str, Any]:
+    """What the report on a flight in a folder says."""
+    return json.loads((folder / REPORT).read_text(encoding="utf-8"))
+
+
 @pytest.fixture(scope="module")
 def report(flown) -> dict[str, Any]:
     with pytest.MonkeyPatch.context() as patch:
         draw_nothing(patch)
         write_report(flown)
-    return json.loads((flown / REPORT).read_text(encoding="utf-8"))
+    return reported(flown)
 
 
 def test_a_report_is_of_the_track_that_was_flown(tmp_path, unseen):
@@ -148,7 +153,7 @@ def test_a_report_is_of_the_track_that_was_flown(tmp_path, unseen):
     for name, kept in (("kept", {TRACK: describe_track(CIRCLE)}), ("old", {})):
         Flown(tmp_path / name, about={"track": "kidney", **kept}).fly()
         write_report(tmp_path / name)
-    kept, old = (json.loads((tmp_path / name / REPORT).read_text(encoding="utf-8")) for name in ("kept", "old"))
+    kept, old = (reported(tmp_path / name) for name in ("kept", "old"))
     assert kept["track"] == "circle" and len(kept["gates"]) == 8 and kept["problems"] == []
     assert old["track"] == "kidney" and len(old["gates"]) != 8
     assert "the recording does not contain its track: today's kidney is used" in old["problems"]
@@ -177,7 +182,7 @@ def test_latencies_are_those_put_in(report):
 @pytest.mark.parametrize("offset", [-5e4, 7e8])
 def test_the_age_of_poses_stamped_by_their_sender(tmp_path, offset, unseen):
     write_report(Flown(tmp_path, stamping=Stamping.sender, offset=offset).fly(60))
-    stages = json.loads((tmp_path / REPORT).read_text())["latency"]["stages"]
+    stages = reported(tmp_path)["latency"]["stages"]
     assert list(stages["pose_age"].values()) == pytest.approx(3 * [1e3 * AGE], abs=1e-3)
 
 
@@ -247,14 +252,14 @@ def test_the_flight_beside_a_simulated_one(tmp_path, flown, figures):
     titles = [axes.get_title(loc="left") for axes in beside.axes[0:6:3]]
     assert titles[0] == "flown\ncircle: 8 gates in 6.46 s (finished)"
     assert titles[1] == "simulated (straight)\ncircle: 0 gates in 1.00 s (timeout)"
-    ticks = json.loads((flown / REPORT).read_text())["latency"]["ticks"]
+    ticks = reported(flown)["latency"]["ticks"]
     assert latency.axes[0].get_xlabel() == f"ms, of armed ticks (n = {ticks})" and ticks > 300
     assert latency.axes[0].get_xlim() == pytest.approx((0.1, 100.0))  # jitter of 0.5 ms, a period of 20
     assert [label.get_text() for label in latency.axes[0].get_yticklabels()][-1] == "end to end"
     assert tracking.axes[0].get_ylabel() == "thrust (m/s²)"
     assert tracking.axes[-1].get_xlabel().startswith("time since arming (s)")
     assert "against: up to 4.0 m/s, 4.0 on average, 0 gates in 1.00 s" in lines
-    assert json.loads((flown / REPORT).read_text())["against"]["distance_m"] == pytest.approx(4.0)
+    assert reported(flown)["against"]["distance_m"] == pytest.approx(4.0)
     for name in (LATENCY, TRAJECTORY, TRACKING):
         with Image.open(flown / name) as image:
             assert image.width > 700
@@ -284,7 +289,7 @@ def test_a_trajectory_has_the_poses_that_the_flyer_chose_by(flown):
 def test_a_flight_that_was_never_armed(tmp_path):
     lines = write_report(Flown(tmp_path, arm=False).fly(50))
     assert "armed for 0.00 s of 0.98 s, ended: never armed" in lines[0]
-    report = json.loads((tmp_path / REPORT).read_text())
+    report = reported(tmp_path)
     assert (report["gates"], report["latency"]["of"], report["figures"]) == ([], "all ticks", [LATENCY])
     assert report["latency"]["stages"]["sent"]["p50_ms"] == pytest.approx(4.0)
     assert not (tmp_path / TRAJECTORY).exists() and not any(report["tracking"].values())
@@ -296,14 +301,14 @@ def test_a_flight_that_was_never_armed(tmp_path):
 def test_flights_of_a_few_ticks(tmp_path, ticks):
     """The 16th is the first armed one."""
     lines = write_report(Flown(tmp_path).fly(ticks))
-    report = json.loads((tmp_path / REPORT).read_text())
+    report = reported(tmp_path)
     assert report["ticks"] == ticks and report["armed_s"] == pytest.approx(PERIOD * max(ticks - 16, 0))
     assert (tmp_path / TRAJECTORY).exists() == (ticks > 16)
     assert report["ended"] == ("never armed" if ticks == 1 else "recording stopped")
     assert lines[-1].startswith(f"written to {tmp_path}: report.json")
 
 
-def test_a_flight_without_poses(tmp_path):
+def test_a_flight_without_poses_and_one_without_ticks(tmp_path):
     chain = FlightChain(Wobble(), CIRCLE, ChainConfig(SafetyLimits.of_track(CIRCLE)))
     with FlightRecorder(tmp_path / FILE, {"track": "circle"}) as recorder:
         for index in range(5):
@@ -312,14 +317,11 @@ def test_a_flight_without_poses(tmp_path):
             outputs = describe_outputs(chain.tick(inputs))
             recorder.tick(0.0, {"in": describe_inputs(inputs), "out": outputs, "took": took})
     write_report(tmp_path / FILE)
-    stages = json.loads((tmp_path / REPORT).read_text())["latency"]["stages"]
-    assert stages["pose_age"] is None and stages["end_to_end"] is None and stages["render"] is None
-
-
-def test_a_flight_without_ticks_is_refused(tmp_path):
-    FlightRecorder(tmp_path / FILE, {"track": "circle"}).close()
+    FlightRecorder(tmp_path / "no_ticks" / FILE, {"track": "circle"}).close()
     with pytest.raises(ValueError, match="the flight has no ticks"):
-        write_report(tmp_path)
+        write_report(tmp_path / "no_ticks")
+    stages = reported(tmp_path)["latency"]["stages"]
+    assert stages["pose_age"] is None and stages["end_to_end"] is None and stages["render"] is None
 
 
 @pytest.mark.parametrize(
@@ -354,15 +356,11 @@ def test_times_out_of_order_and_an_unknown_track_are_refused(tmp_path, flown):
         write_report(tmp_path / "unknown")
 
 
-def test_a_flight_whose_loop_was_killed(tmp_path, flown, unseen):
-    data = (flown / FILE).read_bytes()
+def test_a_flight_whose_loop_was_killed_or_that_is_damaged(tmp_path, flown, unseen):
+    data = bytearray((flown / FILE).read_bytes())
     (tmp_path / FILE).write_bytes(data[: int(0.95 * len(data))])
     lines = write_report(tmp_path)
     assert "note: the file is incomplete: the loop was killed, or is still running" in lines
-
-
-def test_a_damaged_recording_is_refused(tmp_path, flown):
-    data = bytearray((flown / FILE).read_bytes())
     data[len(data) // 2 : len(data) // 2 + 4000] = bytes(4000)
     (tmp_path / FILE).write_bytes(data)
     with pytest.raises(ValueError, match="is not a flight, or is damaged"):

@@ -8,17 +8,12 @@ import numpy as np
 import pytest
 from matplotlib.colors import to_rgba
 
+from dreamer_racing.figures import learning
 from dreamer_racing.figures.comparison import Comparison, VariantResult
 from dreamer_racing.figures.curves import Curve, LearningCurves, learning_curves
-from dreamer_racing.figures.learning import (
-    OTHER_COLOR,
-    REFERENCE_COLOR,
-    line_styles,
-    plot_comparison,
-    plot_learning_curves,
-)
+from dreamer_racing.figures.learning import line_styles, plot_comparison, plot_learning_curves
 from dreamer_racing.figures.runs import CurveKey, find_runs, read_runs
-from tests.figures.test_curves import write_run
+from tests.figures.test_curves import write_metrics, write_run
 from tests.running_recipes import compose
 
 
@@ -132,10 +127,8 @@ def test_a_bar_a_variant_a_dot_a_seed_and_a_line_for_the_reference(tmp_path, fig
     assert axes.get_title(loc="left") == "Gates per episode (deterministic)"
     assert [label.get_text() for label in axes.get_yticklabels()] == ["default", "no replay", "lost"]
     bars = axes.patches
-    assert [(bar.get_width(), bar.get_facecolor()) for bar in bars] == [
-        (3.0, to_rgba(REFERENCE_COLOR)),
-        (4.0, to_rgba(OTHER_COLOR)),
-    ]
+    looks = [(3.0, to_rgba(learning.REFERENCE_COLOR)), (4.0, to_rgba(learning.OTHER_COLOR))]
+    assert [(bar.get_width(), bar.get_facecolor()) for bar in bars] == looks
     (spread,) = [line.get_segments()[0] for line in axes.collections]  # none of a single seed
     deviation = np.sqrt((4 + 1 + 9) / 2)
     np.testing.assert_allclose(spread, [(3 - deviation, 0), (3 + deviation, 0)])
@@ -174,9 +167,9 @@ def test_variants_without_any_value_are_still_listed(tmp_path, figures):
 
 @pytest.mark.parametrize("returns", [[0.0], [0.0, 0.0]])
 def test_one_row_and_nothing_but_zeros_are_drawn_from_zero_on(tmp_path, figures, returns, recwarn):
-    columns = "env_steps,evaluation/gates_per_episode,evaluation/lap_time_mean,held_out/image_error\n"
-    rows = [f"{1000 * index},{value},{value},{value}\n" for index, value in enumerate(returns)]
-    (write_run(tmp_path, "ppo_circle_seed0", algorithm="ppo") / "metrics.csv").write_text(columns + "".join(rows))
+    columns = ["evaluation/gates_per_episode", "evaluation/lap_time_mean", "held_out/image_error"]
+    rows = [(1000 * index, value, value, value) for index, value in enumerate(returns)]
+    write_metrics(write_run(tmp_path, "ppo_circle_seed0", algorithm="ppo"), columns, rows)
     runs, _ = read_runs(find_runs([tmp_path]))
     plot_learning_curves(learning_curves(runs, ["gates", "lap_time", "image_error"]), tmp_path / "figure.png")
     panels = figures[0].axes[:-1]

@@ -31,7 +31,7 @@ def run_dir(tmp_path: Path) -> Path:
         Image.new("RGB", (8, 6), (255, 0, 0)).save(directory.plots / f"{name}.png")
     frames = np.zeros((250, 16, 400, 3), np.uint8)
     frames[:, :, :, 1] = np.arange(250)[:, None, None]
-    write_video(directory.videos / "000002000.mp4", frames, fps=25, scale=1)
+    write_video(directory.videos / "000002000.mp4", frames, fps=25)
     return directory.path
 
 

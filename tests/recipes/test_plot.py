@@ -241,7 +241,7 @@ def test_a_figure_finds_the_columns_that_its_entry_names(runs, recipe, monkeypat
 
     def draw(config, output: Path, read: list, problems: list[str]):
         found.extend(sorted(read[0].metrics.columns))
-        return recipe.Drawn(["new.png"], [])
+        return ["new.png"], []
 
     monkeypatch.setitem(recipe.FIGURES, "new", recipe.Entry(draw, lambda config: ["evaluation/success_rate"]))
     recipe.draw(recipe.PlotConfig(figure="new", runs=str(runs / "runs"), output=str(runs / "figures")))
