@@ -11,7 +11,6 @@ import os
 import sys
 import time
 from collections.abc import Callable, Mapping
-from itertools import chain
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -33,14 +32,10 @@ GAMEPAD_AXES = {"yaw": 0, "throttle": 1, "roll": 2, "pitch": 3}  # mode 2; in SD
 class StickPositions(NamedTuple):
     """Stick positions, each in [−1, 1]."""
 
-    roll: float = 0.0
-    """+ to the right."""
-    pitch: float = 0.0
-    """+ forward, nose down."""
-    yaw: float = 0.0
-    """+ to the right."""
-    throttle: float = 0.0
-    """0 is hover thrust, +1 full thrust, −1 no thrust."""
+    roll: float = 0.0  # + to the right
+    pitch: float = 0.0  # + forward, nose down
+    yaw: float = 0.0  # + to the right
+    throttle: float = 0.0  # 0 is hover thrust, +1 full thrust, −1 no thrust
 
 
 Sticks = Callable[[np.ndarray], StickPositions]
@@ -77,10 +72,7 @@ class HandPolicy(TensorDictModuleBase):
 
 
 def keys_to_sticks(held: Mapping[str, bool], before: StickPositions) -> StickPositions:
-    """Return the sticks a control step after ``before``, moved towards the positions that the keys command.
-
-    The keys are those of `KEYS`; missing ones are not held down.
-    """
+    """Return the sticks a control step after ``before``, moved towards what the `KEYS` that are held down command."""
     wanted = [KEYBOARD_SHARE * (bool(held.get(more)) - bool(held.get(less))) for more, less in KEYS]
     return StickPositions(*(old + EASE * (new - old) for old, new in zip(before, wanted, strict=True)))
 
@@ -92,11 +84,7 @@ def axes_to_sticks(axes: Mapping[str, float]) -> StickPositions:
 
 
 def check_by_hand(kind: str, environment: Mapping[str, str] = os.environ) -> None:
-    """Check that pygame and a display are available.
-
-    Raises:
-        ValueError: pygame is not installed, or there is no display; the message names the remedy.
-    """
+    """Raise ValueError, with the remedy, if pygame or a display is not available."""
     if importlib.util.find_spec("pygame") is None:
         raise ValueError(f"pilot={kind} needs the package pygame: {install_extra('play')}.")
     displays = ("DISPLAY", "WAYLAND_DISPLAY", "SDL_VIDEODRIVER")
@@ -135,11 +123,7 @@ class PygameSticks:
         pygame.display.set_caption("dreamer_racing: arrows, W A S D; escape ends")
 
     def __call__(self, image: np.ndarray) -> StickPositions:
-        """Show an image, wait until the control step is due, and read the sticks.
-
-        Raises:
-            FlightAbandonedError: the window was closed, or escape pressed.
-        """
+        """Show an image, wait until the control step is due, and read the sticks, or raise FlightAbandonedError."""
         pygame = self._pygame
         surface = pygame.surfarray.make_surface(image.swapaxes(0, 1))
         self._window.blit(pygame.transform.scale(surface, (WINDOW, WINDOW)), (0, 0))
@@ -151,10 +135,9 @@ class PygameSticks:
                 raise FlightAbandonedError
         if self._gamepad is not None:
             return axes_to_sticks({name: self._gamepad.get_axis(axis) for name, axis in GAMEPAD_AXES.items()})
-        held = pygame.key.get_pressed()
-        self._at = keys_to_sticks(
-            {name: held[pygame.key.key_code(name)] for name in chain.from_iterable(KEYS)}, self._at
-        )
+        pressed = pygame.key.get_pressed()
+        held = {name: pressed[pygame.key.key_code(name)] for pair in KEYS for name in pair}
+        self._at = keys_to_sticks(held, self._at)
         return self._at
 
     def close(self) -> None:

@@ -279,7 +279,8 @@ def evaluate(
             acted = policy(tensordict)
             judged = value_function(acted[:recorded]) if value_function and recorder.running else None
             tensordict, following = env.step_and_maybe_reset(acted)
-            action, action_before = _applied_action(tensordict["action"]), action
+            # As the environment applies them: clipped, and zero for non-finite entries.
+            action, action_before = tensordict["action"].float().nan_to_num(0.0, 0.0, 0.0).clamp(-1.0, 1.0), action
             change = (action - action_before).norm(dim=-1, keepdim=True)
             steps = _read_step(tensordict["next"], change, env.worlds.effort)
             outcomes, before = [_outcome(step) for step in steps], sum(map(len, flown))
@@ -322,11 +323,6 @@ def _check(env: EnvBase, episodes: int) -> float:
             "env has no ('privileged', ...) entries, which give speeds and paths: make it with privileged=True."
         )
     return float(env.worlds.parameters.control_dt)
-
-
-def _applied_action(action: Tensor) -> Tensor:
-    """Return actions (N, A) as the environment applies them: clipped, and zero for non-finite entries."""
-    return action.float().nan_to_num(0.0, 0.0, 0.0).clamp(-1.0, 1.0)
 
 
 def _read_step(after: TensorDictBase, action_change: Tensor, effort: Tensor) -> list[dict[str, float]]:

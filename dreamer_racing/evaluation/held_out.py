@@ -98,7 +98,7 @@ def held_out_metrics(learner: WorldModelLearner, batch: TensorDictBase) -> dict[
 
 @contextmanager
 def _preserved_random_state(learner: WorldModelLearner) -> Iterator[None]:
-    """Return a context with the autocast of updates that restores the random state on exit."""
+    """Enter the autocast of updates, and restore the random state on exit."""
     devices = [learner.device] if learner.device.type == "cuda" else []
     with torch.random.fork_rng(devices=devices), learner.autocast():
         yield
@@ -128,21 +128,14 @@ def _measure(learner: WorldModelLearner, batch: TensorDictBase, horizon: int) ->
     goes_on = alive[:, -1] * (1 - batch["terminated"].squeeze(-1)[:, -1].float())
     real = (reward * discount[:-1]).sum(1) + discount[-1] * goes_on * value
     imagined = _imagined_return(learner, start, horizon, discount)
-    comparable = _comparable(batch, alive, goes_on_at_first)
+    # A crash inside the horizon is comparable; a timeout is not, because the real return after it is unknown.
+    cut_off = (batch["truncated"].squeeze(-1)[:, SEEN:] & alive.bool()).any(1)
+    comparable = goes_on_at_first & ~cut_off
     if comparable.any():
         imagined, real = imagined[comparable], real[comparable]
         metrics["imagination/return_correlation"] = correlation(imagined, real)
         metrics["imagination/return_bias"] = (imagined - real).mean()
     return metrics
-
-
-def _comparable(batch: TensorDictBase, alive: Tensor, goes_on_at_first: Tensor) -> Tensor:
-    """Return which windows ``(W,)`` are comparable: not begun at an episode's last record, and without a timeout.
-
-    A crash inside the horizon is comparable; a timeout is not, because the real return after it is unknown.
-    """
-    cut_off = (batch["truncated"].squeeze(-1)[:, SEEN:] & alive.bool()).any(1)
-    return goes_on_at_first & ~cut_off
 
 
 def _imagined_return(learner: DreamerV3, start: tuple[Tensor, Tensor], horizon: int, discount: Tensor) -> Tensor:

@@ -1,7 +1,4 @@
-"""Image corruptions: a policy that relies on vision must fail when its images are frozen, blank or noise.
-
-Shapes: N environments, H × W pixels.
-"""
+"""Image corruptions: a policy that relies on vision must fail when its images are frozen, blank or noise."""
 
 from __future__ import annotations
 
@@ -84,11 +81,7 @@ class CorruptedPolicy(torch.nn.Module):
         return self.policy.make_primer()
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Act on the corrupted images.
-
-        Raises:
-            ValueError: there are no images.
-        """
+        """Act on the corrupted images; raise ValueError if there are none."""
         pixels = tensordict.get("pixels", None)
         if pixels is None:
             raise ValueError("image corruptions need images: the environment has no 'pixels'.")

@@ -18,7 +18,6 @@ from dreamer_racing.learners.learner import Policy
 
 EPISODES = 100
 """Minimum number of episodes per condition."""
-
 PRESETS = ("easy", "faithful")
 MODES = ("deterministic", "stochastic")
 
@@ -168,7 +167,7 @@ def fly(
     num_envs: int | None = None,
     **recording: Any,
 ) -> Evaluation:
-    """Create environments, evaluate a policy in them, and close them; arguments as in `Course` and `evaluate`."""
+    """Evaluate a policy in environments made for it; arguments as in `Course` and `evaluate`."""
     course = Course(policy, worlds, episodes, num_envs)
     try:
         return course.evaluate(deterministic, **recording)
@@ -192,22 +191,11 @@ def results_table(results: Sequence[Result], condition: str = "condition") -> st
     rows = []
     for result in results:
         flown = result.evaluation
-        rows.append(
-            (
-                result.preset,
-                result.condition,
-                result.mode,
-                f"{flown.success_rate:.0%}",
-                f"{flown.gates_per_episode:.2f}",
-                _number(flown.lap_time_best),
-                _number(flown.lap_time_mean),
-                f"{flown.speed_max:.1f}",
-                f"{flown.speed_mean:.1f}",
-                _number(flown.gate_offset_mean),
-                f"{flown.action_change_mean:.3f}",
-                crashes_in_words(flown),
-            )
-        )
+        numbers = [f"{flown.success_rate:.0%}", f"{flown.gates_per_episode:.2f}"]
+        numbers += [_number(flown.lap_time_best), _number(flown.lap_time_mean)]
+        numbers += [f"{flown.speed_max:.1f}", f"{flown.speed_mean:.1f}"]
+        numbers += [_number(flown.gate_offset_mean), f"{flown.action_change_mean:.3f}"]
+        rows.append((result.preset, result.condition, result.mode, *numbers, crashes_in_words(flown)))
     return as_markdown(head, rows)
 
 

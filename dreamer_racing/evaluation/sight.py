@@ -34,12 +34,9 @@ START_TEXT = {NO_NOISE: "From the start pose:\n", START_NOISE: "From starts with
 class Sight:
     """Angle and visibility of one gate or decoy in each of M observations."""
 
-    angle: Tensor
-    """(M,) angle between the camera's axis and the direction to the object, degrees; NaN where there is no object."""
-    in_view: Tensor
-    """(M,) bool: the object's centre was in the image."""
-    flight: Tensor
-    """(M,) int64: index of the flight; observations of the same flight are not independent samples."""
+    angle: Tensor  # (M,) between the camera's axis and the direction to the object, degrees; NaN without an object
+    in_view: Tensor  # (M,) bool: the object's centre was in the image
+    flight: Tensor  # (M,) int64: index of the flight; observations of one flight are not independent samples
 
     @property
     def share_in_view(self) -> float:
@@ -78,21 +75,17 @@ def measure_sight(
     """Measure which gates and decoys, or places of decoys, the camera was pointed at, over all observations of flights.
 
     Returns:
-        One `Sight` per object. ``next gate``: the gate to pass next. ``nearest visible gate``: the race gate in view
-        that is nearest to the camera; its angle is NaN while none is in view. ``gate 1``, ``gate 2`` and so on: each
-        race gate. ``decoy 1``, ``decoy 2`` and so on: each decoy. ``any decoy``: in view if any decoy is; its angle is
-        the smallest of the decoys' angles.
+        One `Sight` per object: the ``next gate`` to pass; the ``nearest visible gate``, whose angle is NaN while none
+        is in view; each race gate ``gate 1`` ... and each decoy ``decoy 1`` ...; ``any decoy``, which is in view if any
+        is, at the smallest of their angles.
     """
-    position, attitude, target_gate = (
-        torch.cat([getattr(trajectory, name) for trajectory in trajectories])
-        for name in ("position", "attitude", "target_gate")
-    )
-    flight = torch.repeat_interleave(
-        torch.arange(len(trajectories)), torch.tensor([len(trajectory.position) for trajectory in trajectories])
-    )
+    position = torch.cat([trajectory.position for trajectory in trajectories])
+    attitude = torch.cat([trajectory.attitude for trajectory in trajectories])
+    target_gate = torch.cat([trajectory.target_gate for trajectory in trajectories])
+    flight = torch.cat([torch.full_like(one.target_gate, index) for index, one in enumerate(trajectories)])
     known = position.isfinite().all(-1) & attitude.isfinite().all(-1)
-    position, attitude, target_gate = position[known].double(), attitude[known].double(), target_gate[known]
-    flight = flight[known]
+    position, attitude = position[known].double(), attitude[known].double()
+    target_gate, flight = target_gate[known], flight[known]
     gates = points_in_camera(position, attitude, track.gate_positions(dtype=torch.float64), camera)  # (M, G, 3)
     row = torch.arange(len(gates))
     angle, in_view = angles(gates), is_in_view(gates, camera)  # (M, G)
@@ -174,11 +167,10 @@ def sight_report(
     title: str, looked: dict[str, SightResults], corrupted: dict[float, list[Result]], provenance: dict[str, Any]
 ) -> str:
     """Return the tables as a Markdown page; flights with corrupted images are given by the noise of their starts."""
-    parts = [report_heading(title, provenance), "## What the camera points at\n", START_TEXT[START_NOISE]]
     sights = {name: kind.sights for name, kind in looked.items()}
+    parts = [report_heading(title, provenance), "## What the camera points at\n", START_TEXT[START_NOISE]]
     parts += [sight_table(sights), "Share of time in view, gate by gate:\n", gate_table(sights)]
-    parts.append("![perception](perception.png)\n")
-    parts.append("## Corrupted images\n")
+    parts += ["![perception](perception.png)\n", "## Corrupted images\n"]
     for noise, results in corrupted.items():
         parts += [START_TEXT[noise], results_table(results, "images")]
     return "\n".join(parts)

@@ -201,7 +201,9 @@ def write_trajectory(path: str | Path, trajectory: Trajectory, track: str | Path
         columns = [column for names in STATE.values() for column in names]
         writer.writerow(["t", *columns, *names])
         for index, row in enumerate(zip(*fields, actions, strict=True)):
-            writer.writerow([f"{index * trajectory.control_dt:.6g}", *(_text(cell) for cells in row for cell in cells)])
+            # 9 digits are read back as the same float32.
+            cells = [f"{cell:.9g}" if isinstance(cell, float) else cell for part in row for cell in part]
+            writer.writerow([f"{index * trajectory.control_dt:.6g}", *cells])
 
 
 @contextmanager
@@ -305,15 +307,8 @@ def read_flight(path: str | Path) -> tuple[Trajectory, Track]:
 
 
 def _files(stem: str | Path) -> tuple[Path, Path]:
-    """Return the paths of the numbers and the images of a flight."""
     return Path(f"{stem}{NUMBERS}"), Path(f"{stem}{IMAGES}")
 
 
 def _columns(rows: list[list[str]], columns: list[int]) -> torch.Tensor:
-    """Parse columns of the rows as float32."""
     return torch.tensor([[float(row[column]) for column in columns] for row in rows], dtype=torch.float64).float()
-
-
-def _text(cell: float | int | str) -> str:
-    """Format a float32 so that it is read back exactly."""
-    return f"{cell:.9g}" if isinstance(cell, float) else str(cell)

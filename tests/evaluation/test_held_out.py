@@ -68,9 +68,7 @@ ENDS = {
 
 
 @pytest.mark.parametrize(("ends", "real", "reward_error"), ENDS.values(), ids=ENDS)
-def test_real_returns_by_hand(
-    predictable: DreamerV3, ends: dict[str, int], real: float | None, reward_error: float | None
-) -> None:
+def test_real_returns_by_hand(predictable, ends: dict, real: float | None, reward_error: float | None) -> None:
     batch = make_batch(windows=1)
     batch["reward"][:, FIRST], batch["reward"][:, SECOND] = 1.0, 2.0
     batch["reward"][:, SEEN - 1] = 100.0  # was paid before the horizon

@@ -17,30 +17,10 @@ from torchrl.envs import TensorDictPrimer
 
 from dreamer_racing.envs.torchrl_env import DroneRacingEnv
 from dreamer_racing.envs.tracks import load_track
-from dreamer_racing.evaluation.by_hand import (
-    KEYBOARD_SHARE,
-    FlightAbandonedError,
-    HandPolicy,
-    PygameSticks,
-    StickPositions,
-    axes_to_sticks,
-    check_by_hand,
-    keys_to_sticks,
-)
+from dreamer_racing.evaluation import by_hand, protocol
 from dreamer_racing.evaluation.course import act
 from dreamer_racing.evaluation.evaluate import CRASHES, evaluate
 from dreamer_racing.evaluation.image_corruptions import CorruptedPolicy, intact
-from dreamer_racing.evaluation.protocol import (
-    CONDITIONS,
-    MODES,
-    PRESETS,
-    Condition,
-    check_conditions,
-    crashes_in_words,
-    fly,
-    results_table,
-    run_protocol,
-)
 from dreamer_racing.figures.protocol import mean_bar, plot_conditions, plot_crashes, share_bar
 from dreamer_racing.machine import command_line, git_commit, provenance
 
@@ -71,13 +51,13 @@ def test_a_policy_hands_its_action_back_to_where_the_worlds_are():
     assert act(Falling(), TensorDict({"memory": torch.zeros(2, 1)}, [2]))["action"].device.type == "cpu"
 
 
-def by_name(name: str) -> Condition:
-    return next(condition for condition in CONDITIONS if condition.name == name)
+def by_name(name: str) -> protocol.Condition:
+    return next(condition for condition in protocol.CONDITIONS if condition.name == name)
 
 
 def test_the_conditions_of_the_protocol_and_its_displaced_tracks():
     names = ["nominal", "start_noise", "camera_tilt", "gate_displacement"]
-    assert [condition.name for condition in CONDITIONS] == names
+    assert [condition.name for condition in protocol.CONDITIONS] == names
     (nominal,) = by_name("nominal").races(load_track("circle"), seed=3)
     assert nominal == {"track": load_track("circle"), "start_noise": 0.0, "looks": None, "seed": 3}
     condition, track = by_name("gate_displacement"), load_track("circle")
@@ -100,10 +80,10 @@ def test_camera_tilt_varies_and_no_other_look_does():
 def test_every_condition_is_flown_by_both_policies():
     displaced = dataclasses.replace(by_name("gate_displacement"), num_tracks=3)
     conditions = (by_name("nominal"), by_name("camera_tilt"), displaced)
-    results = list(run_protocol(Falling(), WORLDS, episodes=5, conditions=conditions, num_envs=5))
+    results = list(protocol.run_protocol(Falling(), WORLDS, episodes=5, conditions=conditions, num_envs=5))
     flown = [(result.preset, result.condition, result.mode) for result in results]
     blind = ("nominal", "gate_displacement")  # there is no camera here
-    assert flown == [(preset, name, mode) for preset in PRESETS for name in blind for mode in MODES]
+    assert flown == [(preset, name, mode) for preset in protocol.PRESETS for name in blind for mode in protocol.MODES]
     for result in results:
         record = result.to_dict()
         assert "episodes" not in record and record["num_episodes"] == len(result.evaluation.episodes) == 5
@@ -115,7 +95,7 @@ def test_every_condition_is_flown_by_both_policies():
 def test_both_policies_meet_the_same_starts():
     (race,) = by_name("start_noise").races(load_track("circle"), seed=1)
     first, second = (
-        fly(Falling(), WORLDS | race, 5, deterministic, num_trajectories=5) for deterministic in (True, False)
+        protocol.fly(Falling(), WORLDS | race, 5, deterministic, num_trajectories=5) for deterministic in (True, False)
     )
     starts = torch.stack([flight.position[0] for flight in first.trajectories])
     assert torch.equal(starts, torch.stack([flight.position[0] for flight in second.trajectories]))
@@ -123,12 +103,12 @@ def test_both_policies_meet_the_same_starts():
 
 
 def test_table_and_plots(tmp_path, figures):
-    results = list(run_protocol(Falling(), WORLDS, episodes=2, conditions=CONDITIONS[:1], num_envs=2))
-    table = results_table(results).splitlines()
+    results = list(protocol.run_protocol(Falling(), WORLDS, episodes=2, conditions=protocol.CONDITIONS[:1], num_envs=2))
+    table = protocol.results_table(results).splitlines()
     assert table[0].startswith("| physics | condition | policy | success | gates | best lap (s) ")
     assert len(table) == 2 + 4 and table[2].startswith("| easy | nominal | deterministic | 0% | 0.00 | – | – |")
-    assert crashes_in_words(results[0].evaluation) == "ground: 2 at gate 1"
-    assert results_table(results, "images").splitlines()[0].startswith("| physics | images |")
+    assert protocol.crashes_in_words(results[0].evaluation) == "ground: 2 at gate 1"
+    assert protocol.results_table(results, "images").splitlines()[0].startswith("| physics | images |")
     plot_conditions(results, tmp_path / "conditions.png", "title")
     plot_crashes({"a": results[0].evaluation, "b": results[1].evaluation}, tmp_path / "new" / "crashes.png", "title")
     for path in (tmp_path / "conditions.png", tmp_path / "new" / "crashes.png"):
@@ -146,12 +126,12 @@ def test_table_and_plots(tmp_path, figures):
 
 def test_conditions_that_a_track_has_no_room_for_are_refused_before_any_is_flown():
     circle = load_track("circle")
-    check_conditions(CONDITIONS, circle, seed=0)
+    protocol.check_conditions(protocol.CONDITIONS, circle, seed=0)
     gate = circle.gates[0]
     near = tuple(a - 1.2 * b for a, b in zip(gate.position, gate.forward, strict=True))
     crowded = dataclasses.replace(circle, start_position=near)
     with pytest.raises(ValueError, match=r"condition start_noise cannot be flown on circle: start_noise=2"):
-        check_conditions(CONDITIONS, crowded, seed=0)
+        protocol.check_conditions(protocol.CONDITIONS, crowded, seed=0)
 
 
 def test_intervals_of_bars():
@@ -167,7 +147,7 @@ def test_intervals_of_bars():
 
 def test_a_policy_with_corrupted_images_is_flown_like_any_other():
     worlds = {"track": "circle", "num_threads": 1, "renderer": "warp", "episode_steps": 5}
-    result = fly(CorruptedPolicy(Falling(), intact), worlds, 1, deterministic=True)
+    result = protocol.fly(CorruptedPolicy(Falling(), intact), worlds, 1, deterministic=True)
     assert result.episodes[0].length == 5
 
 
@@ -197,28 +177,29 @@ IMAGE = np.zeros((8, 8, 3), np.uint8)
 @pytest.mark.parametrize(
     ("sticks", "action"),
     [
-        (StickPositions(roll=0.5, pitch=1.0, yaw=0.25), (-0.4, 0.5, 1.0, -0.25)),  # yaw right is −z
-        (StickPositions(throttle=1.0), (1.0, 0, 0, 0)),
-        (StickPositions(throttle=-1.0), (-1.0, 0, 0, 0)),
-        (StickPositions(throttle=0.5), (0.3, 0, 0, 0)),  # half of the way from hovering to all
+        (by_hand.StickPositions(roll=0.5, pitch=1.0, yaw=0.25), (-0.4, 0.5, 1.0, -0.25)),  # yaw right is −z
+        (by_hand.StickPositions(throttle=1.0), (1.0, 0, 0, 0)),
+        (by_hand.StickPositions(throttle=-1.0), (-1.0, 0, 0, 0)),
+        (by_hand.StickPositions(throttle=0.5), (0.3, 0, 0, 0)),  # half of the way from hovering to all
     ],
 )
 def test_sticks_are_actions(sticks, action):
-    flown = HandPolicy(lambda image: sticks, -0.4)(TensorDict({"pixels": torch.zeros(1, 8, 8, 3)}, [1]))["action"]
-    torch.testing.assert_close(flown, torch.tensor([action], dtype=torch.float32))
+    policy, seen = by_hand.HandPolicy(lambda image: sticks, -0.4), TensorDict({"pixels": torch.zeros(1, 8, 8, 3)}, [1])
+    torch.testing.assert_close(policy(seen)["action"], torch.tensor([action], dtype=torch.float32))
 
 
 def test_keys_move_the_sticks_little_by_little_and_let_them_go():
-    at = StickPositions()
+    at = by_hand.StickPositions()
     for _ in range(30):
-        at = keys_to_sticks({"right": True, "down": True, "a": True, "w": True}, at)
-    assert at == pytest.approx((KEYBOARD_SHARE, -KEYBOARD_SHARE, -KEYBOARD_SHARE, KEYBOARD_SHARE), rel=1e-3)
-    assert 0 < keys_to_sticks({}, at).roll < at.roll
-    assert keys_to_sticks({"left": True, "right": True}, StickPositions()) == StickPositions()
+        at = by_hand.keys_to_sticks({"right": True, "down": True, "a": True, "w": True}, at)
+    held = by_hand.KEYBOARD_SHARE
+    assert at == pytest.approx((held, -held, -held, held), rel=1e-3)
+    assert 0 < by_hand.keys_to_sticks({}, at).roll < at.roll
+    assert by_hand.keys_to_sticks({"left": True, "right": True}, by_hand.StickPositions()) == by_hand.StickPositions()
 
 
 def test_a_gamepad_counts_forward_as_negative_and_trembles():
-    assert axes_to_sticks({"roll": 0.5, "pitch": -1.0, "yaw": 0.01, "throttle": -0.25}) == (0.5, 1.0, 0.0, 0.25)
+    assert by_hand.axes_to_sticks({"roll": 0.5, "pitch": -1.0, "yaw": 0.01, "throttle": -0.25}) == (0.5, 1.0, 0.0, 0.25)
 
 
 def test_a_script_flies_and_is_recorded_without_a_display():
@@ -226,11 +207,11 @@ def test_a_script_flies_and_is_recorded_without_a_display():
     shown = []
     env = DroneRacingEnv("circle", 1, evaluation=True, renderer="warp", num_threads=1)
 
-    def up(image: np.ndarray) -> StickPositions:
+    def up(image: np.ndarray) -> by_hand.StickPositions:
         shown.append(image)
-        return StickPositions(throttle=1.0)
+        return by_hand.StickPositions(throttle=1.0)
 
-    result = evaluate(env, HandPolicy(up, env.worlds.parameters.hover_action), episodes=1)
+    result = evaluate(env, by_hand.HandPolicy(up, env.worlds.parameters.hover_action), episodes=1)
     env.close()
     (flight,) = result.trajectories
     assert len(shown) == len(flight.action) > 5 and shown[0].shape == (64, 64, 3)
@@ -242,23 +223,23 @@ def test_without_pygame_or_display_it_says_so(monkeypatch):
     monkeypatch.setattr(sys, "platform", "linux")
     monkeypatch.setattr(importlib.util, "find_spec", lambda name: object())
     with pytest.raises(ValueError, match="pilot=keyboard needs a display"):
-        check_by_hand("keyboard", {})
-    check_by_hand("keyboard", {"DISPLAY": ":0"})
+        by_hand.check_by_hand("keyboard", {})
+    by_hand.check_by_hand("keyboard", {"DISPLAY": ":0"})
     monkeypatch.setattr(importlib.util, "find_spec", lambda name: None)
     with pytest.raises(ValueError, match=r"pilot=gamepad needs the package pygame: .*pip install .*play"):
-        check_by_hand("gamepad", {"DISPLAY": ":0"})
+        by_hand.check_by_hand("gamepad", {"DISPLAY": ":0"})
 
 
 def test_a_window_shows_keeps_time_and_can_be_closed(monkeypatch):
     pygame = pytest.importorskip("pygame", reason="pip install 'dreamer_racing[play]'")
     monkeypatch.setenv("SDL_VIDEODRIVER", "dummy")
     with pytest.raises(ValueError, match="there is no gamepad"):
-        PygameSticks("gamepad", 0.02)
-    sticks = PygameSticks("keyboard", control_dt=0.02)
+        by_hand.PygameSticks("gamepad", 0.02)
+    sticks = by_hand.PygameSticks("keyboard", control_dt=0.02)
     assert pygame.mixer.get_init() is None, "no sound, which many machines cannot play"
-    assert sticks(IMAGE + 255) == StickPositions()
+    assert sticks(IMAGE + 255) == by_hand.StickPositions()
     assert pygame.display.get_surface().get_at((3, 3))[:3] == (255, 255, 255)
     pygame.event.post(pygame.event.Event(pygame.KEYDOWN, key=pygame.K_ESCAPE))
-    with pytest.raises(FlightAbandonedError):
+    with pytest.raises(by_hand.FlightAbandonedError):
         sticks(IMAGE)
     sticks.close()
