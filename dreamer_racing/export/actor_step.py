@@ -1,10 +1,7 @@
 """Export of the recurrent actor as one step with explicit state, published only if all copies match the original.
 
-`ActorStep` takes all recurrent state as inputs and returns it as outputs: ``(observation, h, z, previous_action,
-is_init[, imu][, noise]) -> (action, h_next, z_next)``, batch size 1. `export_actor` writes it for onnxruntime and as a
-``torch.export`` program, and publishes both, with the contract of `contract`, only if they pass `parity`.
-
-A large step can also be written in two `PARTS`: ``advance``, ``(h, z, previous_action, is_init) -> h_next``, needs no
+The step is ``(observation, h, z, previous_action, is_init[, imu][, noise]) -> (action, h_next, z_next)``, batch size 1.
+It can also be written in two `PARTS`: ``advance``, ``(h, z, previous_action, is_init) -> h_next``, needs no
 observation, so that a vehicle can run it between control steps; ``act``, ``(observation, h_next[, imu][, noise]) ->
 (action, z_next)``, is then the only computation between an observation and its action.
 
@@ -40,8 +37,7 @@ from dreamer_racing.training.directory import ensure_writable
 PACKAGES = ("onnx", "onnxscript", "onnxruntime")
 OUTPUTS = ("action", "h_next", "z_next")
 WEIGHTS = "weights.safetensors"
-PROTOBUF_LIMIT = 2_000_000_000
-"""Maximum size in bytes of an ONNX file without external data."""
+PROTOBUF_LIMIT = 2_000_000_000  # bytes, maximum size of an ONNX file without external data
 
 
 class MissingPackagesError(ImportError):
@@ -51,11 +47,7 @@ class MissingPackagesError(ImportError):
 class ActorStep(nn.Module):
     """One step with explicit state: z is the posterior's mode, the action the mean of the actor's clipped samples.
 
-    Args:
-        agent: The agent whose encoder, RSSM and actor are copied.
-
-    Attributes:
-        noise_shape: Shape of the input ``noise``, or None if there is none.
+    Encoder, RSSM and actor are copied from an agent.
 
     Example:
         >>> from dreamer_racing.modules import Interface, get_size
@@ -81,7 +73,7 @@ class ActorStep(nn.Module):
 
     @property
     def noise_shape(self) -> tuple[int, int] | None:
-        """Shape (L, K) of the noise of one step; None without noise."""
+        """Shape (L, K) of the input ``noise``; None without noise."""
         return None
 
     def forward(
@@ -149,10 +141,7 @@ class SampledActorStep(ActorStep):
         return self.size.latents, self.size.classes
 
     def act(self, observation: Tensor, h: Tensor, *more: Tensor) -> tuple[Tensor, Tensor]:
-        """Return action and next state; arguments as in `ActorStep.act`.
-
-        The last argument is the noise: uniform numbers in [0, 1), ``(1, L, K)``.
-        """
+        """Return action and next state as `ActorStep.act`; the last argument is the noise ``(1, L, K)`` in [0, 1)."""
         *imu, noise = more
         probabilities = mix_uniform(self.rssm.posterior_logits(h, self._embed(observation, *imu)), self.rssm.unimix)
         gumbel = -(-noise.log()).log()
@@ -186,11 +175,7 @@ LATENTS: dict[str, type[ActorStep]] = {step.latent: step for step in (ActorStep,
 
 
 def make_step(agent: Agent, latent: str) -> ActorStep:
-    """Make the step of an agent with a latent mode, one of `LATENTS`.
-
-    Raises:
-        ValueError: Unknown latent mode, or an agent that cannot be exported.
-    """
+    """Make the step of an agent with a latent mode, one of `LATENTS`; raise ValueError if it cannot be exported."""
     check_choice("latent", latent, LATENTS)
     if latent == "sample" and not agent.world_model.rssm.sampled:
         raise ValueError(
@@ -209,10 +194,7 @@ def make_step(agent: Agent, latent: str) -> ActorStep:
 
 
 def check_output(output: str | Path) -> Path:
-    """Check the output path and the installed packages before the export starts.
-
-    Returns:
-        The absolute path of the ``.onnx`` file; its folder exists.
+    """Check the installed packages and the path of the ``.onnx`` file; return the path, absolute, with its folder made.
 
     Raises:
         ValueError: The suffix is wrong, or the folder already holds the contract of another actor.
@@ -325,11 +307,7 @@ def export_actor(
 
 
 def write_step(step: ActorStep, onnx: Path, program: Path) -> None:
-    """Write a step as ONNX file with its weights, and as ``torch.export`` program.
-
-    Raises:
-        ValueError: If the weights are too large for one ONNX file.
-    """
+    """Write a step as ONNX file with weights and as ``torch.export`` program; raise ValueError if it is too large."""
     size = sum(parameter.nbytes for parameter in step.parameters())
     if size >= PROTOBUF_LIMIT:
         raise ValueError(f"The actor's weights are {size / 1e9:.1f} GB; an ONNX file holds less than 2 GB.")
@@ -344,15 +322,8 @@ def write_onnx(step: ActorStep | StepPart, outputs: Sequence[str], path: Path) -
     for node in exported.graph.nodes:
         # Otherwise both formats would keep paths of this machine's source files.
         node.meta.pop("stack_trace", None)
-    torch.onnx.export(
-        exported,
-        f=path,
-        dynamo=True,
-        input_names=list(inputs),
-        output_names=list(outputs),
-        external_data=False,
-        verbose=False,
-    )
+    names: dict[str, Any] = {"input_names": list(inputs), "output_names": list(outputs)}
+    torch.onnx.export(exported, f=path, dynamo=True, external_data=False, verbose=False, **names)
     return exported
 
 

@@ -11,7 +11,7 @@ from typing import Any
 
 from torch import Tensor, nn
 
-from dreamer_racing.envs.drone.parameters import GRAVITY, QuadrotorParameters, Randomisation
+from dreamer_racing.envs.drone.parameters import GRAVITY, QuadrotorParameters
 from dreamer_racing.envs.imu import ImuErrors
 from dreamer_racing.envs.race.race import RACE_VECTOR_ENTRIES
 from dreamer_racing.envs.simulator.scene import Camera
@@ -20,13 +20,9 @@ from dreamer_racing.export.onnx_actor import FORMAT
 
 
 def make_contract(
-    step: ActorStep,
-    parameters: QuadrotorParameters,
-    camera: Camera,
-    imu: ImuErrors | None = None,
-    **source: Any,
+    step: ActorStep, parameters: QuadrotorParameters, camera: Camera, imu: ImuErrors | None = None, **source: Any
 ) -> dict[str, Any]:
-    """Return the contract of a step, which describes all inputs and outputs for users without this project.
+    """Return contract.json without ``files`` and ``verification``: a step's inputs and outputs, for users elsewhere.
 
     Args:
         step: The step.
@@ -35,9 +31,6 @@ def make_contract(
         imu: Errors of the IMU that the agent was trained with; None without one.
         source: Origin of the agent, JSON values: checkpoint, env_steps, track and its `hash_track`, preset; and for a
             track from a file its `describe_track` as ``track_description``.
-
-    Returns:
-        The content of contract.json without ``files`` and ``verification``.
     """
     size = step.size
     outputs = dict(zip(OUTPUTS, step(*step.example_inputs().values()), strict=True))
@@ -122,21 +115,20 @@ def describe_camera(camera: Camera) -> dict[str, Any]:
 
 
 def _describe_vector() -> dict[str, Any]:
-    names = [f"{meaning}, {axis}" for meaning, _, _ in RACE_VECTOR_ENTRIES for axis in "xyz"]
-    scales = [(unit, divisor) for _, unit, divisor in RACE_VECTOR_ENTRIES for _ in "xyz"]
     return {
         "formula": "entry = physical / divisor, all vectors in the body frame",
         "channels": [
-            {"name": name, "unit": unit, "divisor": divisor}
-            for name, (unit, divisor) in zip(names, scales, strict=True)
+            {"name": f"{meaning}, {axis}", "unit": unit, "divisor": divisor}
+            for meaning, unit, divisor in RACE_VECTOR_ENTRIES
+            for axis in "xyz"
         ],
     }
 
 
 def _describe_imu(errors: ImuErrors) -> dict[str, Any]:
-    names = ((f"body_rate_{axis}", "rad/s") for axis in "xyz"), ((f"specific_force_{axis}", "m/s^2") for axis in "xyz")
+    units = {"body_rate": "rad/s", "specific_force": "m/s^2"}
     return {
-        "channels": [{"name": name, "unit": unit} for part in names for name, unit in part],
+        "channels": [{"name": f"{name}_{axis}", "unit": unit} for name, unit in units.items() for axis in "xyz"],
         "at_rest": [0.0, 0.0, 0.0, 0.0, 0.0, GRAVITY],
         "trained_errors": asdict(errors),
     }
@@ -144,6 +136,8 @@ def _describe_imu(errors: ImuErrors) -> dict[str, Any]:
 
 def _describe_action(parameters: QuadrotorParameters) -> dict[str, Any]:
     thrust, widths = parameters.collective_thrust_scale, parameters.randomisation
+    half_widths = {} if widths is None else asdict(widths)
+    delay_max = half_widths.pop("delay_max", None)
     return {
         "formula": "physical = offset + scale * action, action clipped to [-1, 1]",
         "channels": [
@@ -155,8 +149,8 @@ def _describe_action(parameters: QuadrotorParameters) -> dict[str, Any]:
         ],
         "hover": [parameters.hover_action, 0.0, 0.0, 0.0],
         "trained_mass_kg": parameters.mass,
-        "trained_command_delay_s": parameters.command_delay if widths is None else [0.0, widths.delay_max],
-        **({} if widths is None else {"trained_half_widths": _half_widths(widths)}),
+        "trained_command_delay_s": parameters.command_delay if widths is None else [0.0, delay_max],
+        **({} if widths is None else {"trained_half_widths": half_widths}),
     }
 
 
@@ -175,11 +169,6 @@ def describe_rate_loop(parameters: QuadrotorParameters) -> dict[str, Any]:
             "motor_lag": widths.motor_lag if widths else 0.0,
         },
     }
-
-
-def _half_widths(widths: Randomisation) -> dict[str, float]:
-    """Return the half-widths of the randomisation in training, without the delay, which is described separately."""
-    return {name: value for name, value in asdict(widths).items() if name != "delay_max"}
 
 
 def hash_weights(step: nn.Module) -> str:

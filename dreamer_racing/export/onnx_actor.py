@@ -39,10 +39,7 @@ _TENSOR = {"name": str, "shape": [int], "type": str}
 _LAYOUT = {
     "inputs": [_TENSOR],
     "outputs": [_TENSOR],
-    "files": {
-        "onnx": {"sha256": str},
-        **{f"{kind}?": {"name": str, "sha256": str} for kind in ("weights", "advance", "act")},
-    },
+    "files": {"onnx": {"sha256": str}, **{f"{kind}?": {"name": str, "sha256": str} for kind in ("weights", *PARTS)}},
     "model": {},
     "weights_sha256": str,
     "action": {"channels": [{"name": str, "unit": str, "offset": float, "scale": float}]},
@@ -300,11 +297,8 @@ def _layout_mismatch(value: Any, layout: Any, name: str) -> str:
     if isinstance(layout, dict):
         if not isinstance(value, dict):
             return f"{name} is {_short(value)}, not an object"
-        wanted = {
-            key.removesuffix("?"): inner
-            for key, inner in layout.items()
-            if key[-1] != "?" or value.get(key[:-1]) is not None
-        }
+        needed = [key for key in layout if key[-1] != "?" or value.get(key[:-1]) is not None]
+        wanted = {key.removesuffix("?"): layout[key] for key in needed}
         if absent := wanted.keys() - value.keys():
             return f"{name or 'it'} lacks {', '.join(sorted(absent))}"
         parts = [(value[key], inner, f"{name}.{key}".lstrip(".")) for key, inner in wanted.items()]

@@ -26,10 +26,8 @@ ACTION_TOLERANCE = 1e-4
 """Largest allowed deviation of an action, in [−1, 1], from the original's: 1.3 mm/s² of thrust, 0.001 rad/s."""
 LATENT_TOLERANCE = 1e-3
 """Largest allowed deviation of a class probability from the original's; a sample of another class deviates by 1."""
-MIN_STEPS = 200
-"""Minimum number of steps of a recorded flight."""
-MIN_EPISODES = 4
-"""Minimum number of episodes, and so of resets, in a recorded flight."""
+MIN_STEPS, MIN_EPISODES = 200, 4
+"""Minimum numbers of steps, and of episodes and so of resets, of a recorded flight."""
 
 
 class ParityError(RuntimeError):
@@ -38,19 +36,12 @@ class ParityError(RuntimeError):
 
 @dataclass(frozen=True)
 class RecordedFlight:
-    """A recorded flight of T steps.
+    """A recorded flight of T steps."""
 
-    Attributes:
-        observations: uint8 ``(T, height, width, 3)`` or float32 ``(T, V)``.
-        is_init: Whether each step is its episode's first, bool ``(T,)``.
-        actions: Actions of the policy, ``(T, A)``.
-        imu: IMU measurements, float32 ``(T, 6)``; None without an IMU.
-    """
-
-    observations: np.ndarray
-    is_init: np.ndarray
-    actions: np.ndarray
-    imu: np.ndarray | None = None
+    observations: np.ndarray  # uint8 (T, height, width, 3) or float32 (T, V)
+    is_init: np.ndarray  # bool (T,): whether each step is its episode's first
+    actions: np.ndarray  # (T, A), of the policy
+    imu: np.ndarray | None = None  # float32 (T, 6); None without an IMU
 
     @property
     def episodes(self) -> int:
@@ -60,15 +51,7 @@ class RecordedFlight:
 
 @torch.no_grad()
 def record_flight(env: DroneRacingEnv, agent: Agent, steps: int) -> RecordedFlight:
-    """Record T steps of the deterministic policy in an environment with one drone.
-
-    For resets, the environment has episodes of `episode_steps`.
-
-    Raises:
-        ValueError: The environment has several drones.
-    """
-    if env.batch_size != (1,):
-        raise ValueError(f"env has batch size {list(env.batch_size)}; a flight is recorded with num_envs=1.")
+    """Record T steps of the deterministic policy in an environment with one drone and episodes of `episode_steps`."""
     policy = DreamerPolicy(agent.world_model, agent.actor, deterministic=True)
     flying = with_memory(env, policy.make_primer())
     names = (*agent.interface.observation_keys, "is_init", "action")
@@ -83,11 +66,7 @@ def record_flight(env: DroneRacingEnv, agent: Agent, steps: int) -> RecordedFlig
 
 
 def episode_steps(steps: int) -> int:
-    """Return the episode length in steps with which a flight has ``MIN_EPISODES`` episodes.
-
-    Raises:
-        ValueError: Fewer than ``MIN_STEPS`` steps.
-    """
+    """Return the length of episodes with which a flight has ``MIN_EPISODES``; raise ValueError if it is too short."""
     check_steps(steps)
     return math.ceil(steps / MIN_EPISODES)
 
@@ -111,13 +90,10 @@ class TorchActor(RecurrentActor):
 
 
 def check_parity(actors: Mapping[str, RecurrentActor], flight: RecordedFlight, seed: int = 0) -> dict[str, float]:
-    """Replay a recorded flight with each actor, and compare them with the first.
+    """Replay a recorded flight with each actor; return each one's largest deviation of an action from the first's.
 
     If latents are not sampled, the first actor, the original, is also compared with the recorded actions. Else all get
     the same noise, of the seed.
-
-    Returns:
-        Largest deviation of an action of each actor but the first, by name.
 
     Raises:
         ParityError: If an action deviates by more than ``ACTION_TOLERANCE``, or a latent by more than

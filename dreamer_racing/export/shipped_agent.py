@@ -121,12 +121,9 @@ class ShippedAgent:
         _require_files(folder, *(file["name"] for part in PARTS if (file := contract["files"].get(part))))
         check_env(folder, contract, env)
         agent = Agent(_size(contract["model"]), Interface.of(env), decode=False)
-        for module, unused in (
-            (agent, "critic"),
-            (agent.world_model, "reward_head"),
-            (agent.world_model, "continue_head"),
-        ):
-            module.register_module(unused, None)
+        agent.register_module("critic", None)
+        agent.world_model.register_module("reward_head", None)
+        agent.world_model.register_module("continue_head", None)
         load_networks(folder, agent)
         # Hash the file, not the network: newer networks may have entries that the file lacks.
         if hash_tensors(read_weights(folder / WEIGHTS)) != contract["weights_sha256"]:
@@ -164,12 +161,11 @@ def load_networks(folder: Path, agent: Agent) -> None:
         ValueError: If names or shapes differ.
     """
     weights = read_weights(folder / WEIGHTS)
-    names = {"encoder": "world_model.encoder", "rssm": "world_model.rssm", "actor": "actor"}
+    parts = {"encoder.": agent.world_model.encoder, "rssm.": agent.world_model.rssm, "actor.": agent.actor}
     try:
-        for short, name in names.items():
-            mine = f"{short}."
-            own = {key.removeprefix(mine): value for key, value in weights.items() if key.startswith(mine)}
-            agent.get_submodule(name).load_state_dict(own)
+        for prefix, part in parts.items():
+            own = {key.removeprefix(prefix): value for key, value in weights.items() if key.startswith(prefix)}
+            part.load_state_dict(own)
     except RuntimeError as error:
         raise ValueError(f"{folder / WEIGHTS} does not fit {folder / CONTRACT}: {error}") from error
 

@@ -1,9 +1,6 @@
 """Weights as a safetensors file, which torch can read and an ONNX file can use as external data.
 
-A file holds the length of a JSON header (8 bytes, little-endian), the header (name → type, shape, begin and end), and
-the bytes of all tensors. Reading it executes no code.
-
-Reference: huggingface/safetensors, ``README.md``, section Format.
+Reading it executes no code. Reference: huggingface/safetensors, ``README.md``, section Format.
 """
 
 from __future__ import annotations
@@ -18,8 +15,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-_LENGTH = 8  # bytes of the length field
-_ALIGNMENT = 8  # bytes; the header is padded with blanks to a multiple of it
+_LENGTH = 8  # bytes of the length field; the header is padded with blanks to a multiple of it
 _TYPE, _NUMPY = "F32", np.dtype("<f4")
 
 
@@ -31,11 +27,7 @@ class Extent(NamedTuple):
 
 
 def write_weights(path: str | Path, weights: Mapping[str, Tensor]) -> dict[str, Extent]:
-    """Write float32 tensors, sorted by name; return the extent of each.
-
-    Raises:
-        ValueError: If a tensor is not float32.
-    """
+    """Write float32 tensors, sorted by name; return the extent of each; raise ValueError for other types."""
     header: dict[str, dict[str, Any]] = {}
     buffers, end = [], 0
     for name, value in sorted(weights.items()):
@@ -45,9 +37,9 @@ def write_weights(path: str | Path, weights: Mapping[str, Tensor]) -> dict[str, 
         begin, end = end, end + len(buffers[-1])
         header[name] = {"dtype": _TYPE, "shape": list(value.shape), "data_offsets": [begin, end]}
     text = json.dumps(header, separators=(",", ":")).encode()
-    text += b" " * (-len(text) % _ALIGNMENT)
-    first = _LENGTH + len(text)
+    text += b" " * (-len(text) % _LENGTH)
     Path(path).write_bytes(len(text).to_bytes(_LENGTH, "little") + text + b"".join(buffers))
+    first = _LENGTH + len(text)
     offsets = {name: entry["data_offsets"] for name, entry in header.items()}
     return {name: Extent(first + begin, end - begin) for name, (begin, end) in offsets.items()}
 

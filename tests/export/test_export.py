@@ -22,22 +22,9 @@ from dreamer_racing.envs.drone.parameters import PRESETS
 from dreamer_racing.envs.simulator.scene import Camera
 from dreamer_racing.export import actor_step as export
 from dreamer_racing.export import onnx_actor
-from dreamer_racing.export.actor_step import (
-    ActorStep,
-    MissingPackagesError,
-    SampledActorStep,
-    check_output,
-    export_actor,
-    make_step,
-)
+from dreamer_racing.export.actor_step import ActorStep, SampledActorStep, check_output, export_actor, make_step
 from dreamer_racing.export.contract import hash_weights, make_contract
-from dreamer_racing.export.parity import (
-    MIN_STEPS,
-    ParityError,
-    RecordedFlight,
-    TorchActor,
-    check_parity,
-)
+from dreamer_racing.export.parity import MIN_STEPS, ParityError, RecordedFlight, TorchActor, check_parity
 from dreamer_racing.export.shipped_agent import load_agent
 from dreamer_racing.modules import Interface, ModelSize, get_size
 from dreamer_racing.modules.agent import Agent
@@ -77,12 +64,10 @@ def contract_of(step: ActorStep) -> dict:
 def make_flight(agent: Agent, steps: int = MIN_STEPS) -> RecordedFlight:
     """Random observations, with a reset in every 40 steps and two next to each other, and the policy's answers."""
     random = np.random.default_rng(0)
-    interface = agent.interface
-    observations = (
-        random.integers(0, 256, (steps, 64, 64, 3), np.uint8)
-        if interface.pixels
-        else random.normal(size=(steps, interface.vector_dim)).astype(np.float32)
-    )
+    if agent.interface.pixels:
+        observations = random.integers(0, 256, (steps, 64, 64, 3), np.uint8)
+    else:
+        observations = random.normal(size=(steps, agent.interface.vector_dim)).astype(np.float32)
     is_init = np.arange(steps) % 40 == 0
     is_init[121] = True
     return answered(agent, observations, is_init)
@@ -131,11 +116,8 @@ def test_a_sample_is_the_gumbel_maximum_of_the_posterior(agent: Agent) -> None:
     inputs = {name: value.expand(count, *value.shape[1:]) for name, value in step.example_inputs().items()}
     noise = torch.rand(count, *step.noise_shape, generator=torch.Generator().manual_seed(0))
     z = step(*(inputs | {"noise": noise}).values())[2].unflatten(-1, step.noise_shape)
-    posterior = agent.world_model.observe(
-        {"pixels": torch.zeros(1, 1, 64, 64, 3, dtype=torch.uint8)},
-        torch.zeros(1, 1, 4),
-        torch.ones(1, 1, dtype=torch.bool),
-    )
+    pixels, is_init = torch.zeros(1, 1, 64, 64, 3, dtype=torch.uint8), torch.ones(1, 1, dtype=torch.bool)
+    posterior = agent.world_model.observe({"pixels": pixels}, torch.zeros(1, 1, 4), is_init)
     probabilities = mix_uniform(posterior.posterior_logits[0, 0], agent.world_model.rssm.unimix).double()
     expected = (probabilities.log() - (-noise.double().log()).log()).argmax(-1)
     assert torch.equal(z.argmax(-1), expected) and torch.equal(z.sum(-1), torch.ones(count, 4))
@@ -164,9 +146,7 @@ def test_noise_of_zero_is_no_accident(agent: Agent) -> None:
     ],
     ids=["block-sample", "learned-mode", "vector-mode"],
 )
-def test_every_architecture_flies_alike(
-    size: ModelSize | str, interface: Interface, latent: str, tmp_path: Path
-) -> None:
+def test_every_architecture_flies_alike(size, interface: Interface, latent: str, tmp_path: Path) -> None:
     agent = make_agent(size, interface)
     step, flight = make_step(agent, latent), make_flight(agent)
     deviation = export_actor(step, contract_of(step), flight, tmp_path / "actor.onnx")
@@ -192,9 +172,7 @@ def copies(onnx: Path, program: Path) -> Callable[[ActorStep, Path, Path], None]
     return write
 
 
-def test_an_export_of_another_kind_leaves_nothing_of_an_earlier_one(
-    agent: Agent, exports: Callable[[str], Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_an_export_of_another_kind_leaves_nothing_of_an_earlier_one(agent, exports, tmp_path, monkeypatch) -> None:
     step, flight, earlier = make_step(agent, "mode"), make_flight(agent), exports("mode")
     other = tmp_path / "weights.safetensors"  # where no export has been
     other.write_text("mine", encoding="utf-8")
@@ -251,13 +229,7 @@ def test_a_step_in_two_parts_is_the_whole_one(kind: str, in_parts: Callable[[str
         whole.prepare()  # nothing
 
 
-def test_parts_of_another_export_are_refused(
-    in_parts: Callable[[str], InParts],
-    agent: Agent,
-    exports: Callable[[str], Path],
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_parts_of_another_export_are_refused(in_parts, agent, exports, tmp_path: Path, monkeypatch) -> None:
     shutil.copytree(in_parts("block")[0].parent, tmp_path, dirs_exist_ok=True)  # with shared weights
     output = tmp_path / "actor.onnx"
     contract = json.loads((tmp_path / "contract.json").read_text())
@@ -330,15 +302,7 @@ def altered(agent: Agent, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.mark.parametrize(("kind", "name"), [("onnx", "onnxruntime"), ("program", "torch.export")])
-def test_an_altered_weight_is_refused(
-    kind: str,
-    name: str,
-    agent: Agent,
-    altered: Path,
-    exports: Callable[[str], Path],
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_an_altered_weight_is_refused(kind: str, name: str, agent, altered, exports, tmp_path, monkeypatch) -> None:
     files = {"onnx": exports("mode"), "program": exports("mode").with_suffix(".pt2")}
     shutil.copytree(exports("mode").parent, tmp_path, dirs_exist_ok=True)
     step = ActorStep(agent)
@@ -402,15 +366,11 @@ def test_the_contract_says_what_a_pilot_must_know(exported: Path, agent: Agent) 
     contract = json.loads((exported.parent / "contract.json").read_text())
     step = make_step(agent, contract["latent"])
     inputs = {entry["name"]: (entry["shape"], entry["type"]) for entry in contract["inputs"]}
-    expected = {
-        "image_u8": ([1, 64, 64, 3], "uint8"),
-        "h": ([1, 32], "float32"),
-        "z": ([1, 16], "float32"),
-        "previous_action": ([1, 4], "float32"),
-        "is_init": ([1], "bool"),
-    }
-    sampled = contract["latent"] == "sample"
-    assert inputs == expected | ({"noise": ([1, 4, 4], "float32")} if sampled else {})
+    assert inputs == {
+        "image_u8": ([1, 64, 64, 3], "uint8"), "h": ([1, 32], "float32"), "z": ([1, 16], "float32"),
+        "previous_action": ([1, 4], "float32"), "is_init": ([1], "bool"),
+        **({"noise": ([1, 4, 4], "float32")} if contract["latent"] == "sample" else {}),
+    }  # fmt: skip
     assert [entry["name"] for entry in contract["outputs"]] == ["action", "h_next", "z_next"]
     assert contract["control"] == {"rate_hz": 50.0, "period_s": 0.02}
     camera = contract["camera"]
@@ -468,23 +428,23 @@ print("flown")
 """
 
 
+def python(*arguments: str, **options: object) -> subprocess.CompletedProcess[str]:
+    return subprocess.run([sys.executable, *arguments], capture_output=True, text=True, timeout=60, **options)
+
+
 @pytest.mark.parametrize("alone", [True, False], ids=["plain file", "package"])
 def test_the_flight_side_needs_no_torch(alone: bool, exported: Path, tmp_path: Path) -> None:
     forbidden, module = ["torch", "tensordict", "torchrl", "mujoco", "hydra"], "dreamer_racing.export.onnx_actor"
     if alone:
         shutil.copy(onnx_actor.__file__, tmp_path)
         forbidden, module = [*forbidden, "gymnasium", "dreamer_racing", "onnx", "onnxscript"], "onnx_actor"
-    program = FORBIDDING.format(forbidden=forbidden, module=module, path=str(exported))
-    done = subprocess.run(
-        [sys.executable, "-c", program], cwd=tmp_path, capture_output=True, text=True, timeout=60, check=False
-    )
+    done = python("-c", FORBIDDING.format(forbidden=forbidden, module=module, path=str(exported)), cwd=tmp_path)
     assert done.returncode == 0, done.stderr
     assert done.stdout == "flown\n"
 
 
 def test_the_flight_side_measures_itself(exported: Path) -> None:
-    command = [sys.executable, onnx_actor.__file__, str(exported), "--steps", "30"]
-    done = subprocess.run(command, capture_output=True, text=True, timeout=60, check=False)
+    done = python(onnx_actor.__file__, str(exported), "--steps", "30")
     assert done.returncode == 0, done.stderr
     assert "30 steps, 1 thread(s): p50" in done.stdout and "p99" in done.stdout and "max" in done.stdout
 
@@ -605,7 +565,7 @@ def test_bad_arguments_are_refused(agent: Agent, tmp_path: Path, monkeypatch: py
         export_actor(step, contract_of(step), make_flight(agent), tmp_path / "new" / "actor.onnx")
     assert not list((tmp_path / "new").iterdir())
     monkeypatch.setattr(export, "PACKAGES", ("onnx", "no_such_package"))
-    with pytest.raises(MissingPackagesError, match=r"needs no_such_package.*\[export\]"):
+    with pytest.raises(export.MissingPackagesError, match=r"needs no_such_package.*\[export\]"):
         check_output(tmp_path / "actor.onnx")
 
 
@@ -632,13 +592,8 @@ def test_the_recipe_exports_a_run(run_dir: Path) -> None:
     assert "Warning" not in done.stderr
     folder = run_dir / "export"
     assert {path.name for path in folder.iterdir()} == {"actor.onnx", "actor.pt2", "contract.json"}
-    for words in (
-        "replayed: 200 steps",
-        "onnxruntime from torch",
-        "1 thread, onnxruntime: p50",
-        "1 thread, torch: p50",
-    ):
-        assert words in done.stdout
+    shown = ("replayed: 200 steps", "onnxruntime from torch", "1 thread, onnxruntime: p50", "1 thread, torch: p50")
+    assert all(words in done.stdout for words in shown), done.stdout
     contract = json.loads((folder / "contract.json").read_text())
     assert contract["control"] == {"rate_hz": 40.0, "period_s": 0.025}
     assert contract["camera"]["tilt_up_deg"] == 30.0 and contract["action"]["trained_command_delay_s"] == [0.0, 0.04]
@@ -680,9 +635,7 @@ def test_the_recipe_refuses_a_copy_that_flies_differently(run_dir: Path) -> None
     ],
     ids=["checkpoint", "output", "steps"],
 )
-def test_bad_input_gets_a_plain_error(
-    run_dir: Path, settings: dict, words: list[str], capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_bad_input_gets_a_plain_error(run_dir: Path, settings: dict, words: list[str], capsys) -> None:
     exporting = recipe_module("export")
     with pytest.raises(SystemExit) as refused, recipe_module("composing.entry").plain_errors():
         exporting.export(exporting.ExportConfig(**{"checkpoint": str(run_dir), **settings}))
