@@ -353,7 +353,6 @@ def _outcome(step: dict[str, float]) -> str | None:
 
 
 def _summarise(values: dict[str, list[float]], outcome: str, control_dt: float) -> Episode:
-    """Return the statistics of an episode from the measurements of its steps."""
     speeds = [speed for speed in values["speed"] if speed < math.inf] or [0.0]  # a diverged state has no speed
     changes = values["action_change"][1:]  # the first is relative to the previous episode
     passed = values["gates_passed"]

@@ -117,7 +117,6 @@ def _read_other(path: Path) -> NamedFlight:
 
 
 def _make_report(flight: FlownFlight, passes: list[GatePass], response: dict[str, Response]) -> dict[str, Any]:
-    """Return the content of report.json without figures and the flights' summaries."""
     config, ticks = flight.about.get("config") or {}, flight.time[flight.flown]
     began = float(ticks[0]) if len(ticks) else 0.0
     problems = [] if flight.whole else ["the file is incomplete: the loop was killed, or is still running"]
@@ -162,7 +161,6 @@ def _summary(trajectory: Trajectory) -> dict[str, float]:
 
 
 def _draw_latencies(latency: dict[str, Any], rate: float | None, path: Path) -> None:
-    """Draw median, p99 and maximum of each stage on a logarithmic axis."""
     stages = {name: row for name, row in latency["stages"].items() if row is not None}
     figure = Figure(figsize=(7.0, 1.2 + 0.34 * max(len(stages), 1)), layout="constrained")
     axes = figure.subplots()

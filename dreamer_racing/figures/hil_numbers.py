@@ -214,7 +214,6 @@ def _measured_thrust(time: np.ndarray, poses: list[Pose]) -> tuple[np.ndarray, n
 
 
 def _read_ticks(ticks: list[dict[str, Any]], clock: PoseClock) -> dict[str, Any]:
-    """Return the fields of `FlownFlight` about ticks and poses."""
     inputs, outputs = [read_inputs(tick["in"]) for tick in ticks], [tick["out"] for tick in ticks]
     commands = np.array([out["command"] for out in outputs], float).reshape(-1, 5)
     seen = [13 * [np.nan] if out["pose"] is None else out["pose"] for out in outputs]

@@ -114,7 +114,6 @@ def _look_at(server: viser.ViserServer, track: Track) -> None:
 
 
 def _add_hall(scene: viser.SceneApi, track: Track) -> None:
-    """Draw the floor with a grid of 1 m, and the edges of the bounding box."""
     low, high = np.array(track.bounds_low), np.array(track.bounds_high)
     width, depth, _ = high - low
     lines = _rgb(FLOOR_LINES)
@@ -159,7 +158,6 @@ def _add_gate(
 
 
 def _add_line(scene: viser.SceneApi, name: str, trajectory: Trajectory, colors: Colormap, speed: Normalize) -> None:
-    """Draw a path, coloured by speed."""
     points = trajectory.position.numpy()
     points = points[np.isfinite(points).all(axis=1)]  # (K + 1, 3), or one row less if the last state diverged
     shades = _linear(colors(speed(trajectory.speed.numpy()[: len(points)]))[:, :3])

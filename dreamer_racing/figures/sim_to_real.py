@@ -52,7 +52,6 @@ def plot_study(results: Sequence[Mapping[str, Any]], path: str | Path) -> None:
 
 
 def _draw_sweep(column: np.ndarray, sweep: str, results: Sequence[Mapping[str, Any]]) -> None:
-    """Draw one sweep of all studies into its two panels."""
     flown = [[flight for flight in result["flights"] if flight["sweep"] == sweep] for result in results]
     values = sorted({flight["value"] for flights in flown for flight in flights})
     for number, (result, flights, color) in enumerate(zip(results, flown, COLORS, strict=False)):
