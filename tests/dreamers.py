@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
+from collections.abc import Sequence
 from typing import Any
 
 import torch
@@ -12,41 +14,62 @@ from torch import Tensor
 from dreamer_racing.learners.config import LearnerConfig
 from dreamer_racing.learners.dreamer_v3 import DreamerV3
 from dreamer_racing.learners.latent_ppo import LatentPPO
-from dreamer_racing.losses import DreamerV3Losses, LatentPPOLosses, Latents, Trajectory
-from dreamer_racing.modules import Interface, ModelSize
+from dreamer_racing.losses import Latents, Trajectory
+from dreamer_racing.modules import RSSM, SIZES, Interface, ModelSize
 
 OF_UPDATES = {field.name for field in dataclasses.fields(LearnerConfig)}
+Places = Sequence[tuple[int, int]]
+"""Records of windows: (window, step) of each."""
 
 
 def learner_of(
     size: ModelSize | str = "debug",
     interface: Interface | None = None,
     *,
+    kind: Any = DreamerV3,
     device: torch.device | str = "cpu",
     seed: int | None = None,
     horizon: int = 16,
     **numbers: Any,
-) -> DreamerV3:
-    """A learner with numbers of `DreamerV3Losses` and of `LearnerConfig`."""
-    config = LearnerConfig(
-        imagination_horizon=horizon, **{name: value for name, value in numbers.items() if name in OF_UPDATES}
-    )
-    losses = DreamerV3Losses(**{name: value for name, value in numbers.items() if name not in OF_UPDATES})
-    return DreamerV3.make(size, interface, losses, config, device=device, seed=seed)
+) -> Any:
+    """A learner with numbers of its losses and of `LearnerConfig`."""
+    of_updates = {name: value for name, value in numbers.items() if name in OF_UPDATES}
+    losses = kind.Losses(**{name: value for name, value in numbers.items() if name not in OF_UPDATES})
+    config = LearnerConfig(imagination_horizon=horizon, **of_updates)
+    return kind.make(size, interface, losses, config, device=device, seed=seed)
 
 
-def latent_ppo_of(
-    size: ModelSize | str = "debug",
-    interface: Interface | None = None,
+latent_ppo_of = functools.partial(learner_of, kind=LatentPPO)
+
+
+def make_windows(
+    batch: int,
+    time: int,
     *,
-    device: torch.device | str = "cpu",
-    seed: int | None = None,
-    **numbers: Any,
-) -> LatentPPO:
-    """A learner with numbers of `LatentPPOLosses` and of `LearnerConfig`."""
-    config = LearnerConfig(**{name: value for name, value in numbers.items() if name in OF_UPDATES})
-    losses = LatentPPOLosses(**{name: value for name, value in numbers.items() if name not in OF_UPDATES})
-    return LatentPPO.make(size, interface, losses, config, device=device, seed=seed)
+    is_init: Places = (),
+    terminated: Places = (),
+    truncated: Places = (),
+    image_size: int = 64,
+    vector: int = 0,
+    privileged: int = 0,
+) -> TensorDict:
+    """Windows of random records, some of which are flagged."""
+    shape, generator = (batch, time), torch.Generator().manual_seed(1)
+    flags = {name: torch.zeros(*shape, 1, dtype=torch.bool) for name in ("is_init", "terminated", "truncated")}
+    for flag, places in zip(flags.values(), (is_init, terminated, truncated), strict=True):
+        for place in places:
+            flag[place] = True
+    images = torch.randint(0, 256, (*shape, image_size, image_size, 3), dtype=torch.uint8, generator=generator)
+    widths = {"reward": 1, "vector": vector, ("privileged", "vector"): privileged}
+    numbers = {key: torch.randn(*shape, width, generator=generator) for key, width in widths.items() if width}
+    action = torch.rand(*shape, 4, generator=generator) * 2 - 1
+    return TensorDict({"pixels": images, "previous_action": action, **numbers, **flags}, shape)
+
+
+def rssm_of(**numbers: Any) -> RSSM:
+    """An RSSM of embeddings of 8 and actions of 4 numbers, D = 16, L = 3, K = 4, unless other numbers are given."""
+    size = {"belief": 16, "hidden": 8, "latents": 3, "classes": 4, **numbers}
+    return RSSM(dataclasses.replace(SIZES["size1m"], **size), embedding=8, action=4)
 
 
 def imagine_from(

@@ -30,13 +30,6 @@ class Agent(nn.Module):
         decode: Whether the world model has decoders of the observations.
         min_std: Smallest standard deviation of actions.
         max_std: Largest standard deviation of actions.
-
-    Attributes:
-        size: As given.
-        interface: As given.
-        world_model: Encoder, dynamics, decoders, reward and continue heads.
-        actor: Policy head.
-        critic: Value function with its slow copy.
     """
 
     def __init__(
@@ -88,14 +81,7 @@ class DreamerPolicy(TensorDictModuleBase):
         self.deterministic = deterministic
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Write the action and the next recurrent keys.
-
-        Args:
-            tensordict: Batch size ``[N]`` or ``[]``.
-
-        Returns:
-            The same tensordict.
-        """
+        """Write the action and the next recurrent keys to a tensordict of any batch size, and return it."""
         batch = tensordict.batch_size
         flat = {key: tensordict.get(key).reshape(-1, *tensordict.get(key).shape[len(batch) :]) for key in self.in_keys}
         policy, action, belief, state = self._decide(flat)

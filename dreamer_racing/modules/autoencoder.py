@@ -5,7 +5,7 @@ Shape legend: N any batch, C channels, V vector, E embedding, F features, G bloc
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from itertools import pairwise
 
 import torch
@@ -20,7 +20,7 @@ from dreamer_racing.modules.layers import (
     NormedLinear,
     autocast_type,
     in_own_type,
-    initialize_convolution,
+    initialize,
     linear,
 )
 from dreamer_racing.modules.sizes import ModelSize
@@ -28,11 +28,6 @@ from dreamer_racing.modules.sizes import ModelSize
 
 def smallest_map(image_size: int, patch: int, stages: int) -> int:
     """Return the side of the last feature map of an image whose pixel blocks are folded and which is then halved.
-
-    Args:
-        image_size: Height and width of the image, pixels.
-        patch: Side of the blocks.
-        stages: Number of halvings.
 
     Raises:
         ValueError: If the image's size is not divisible by that.
@@ -52,6 +47,14 @@ def make_convolution(in_channels: int, out_channels: int, kernel: int, stride: i
     layer = nn.Conv2d(in_channels, out_channels, kernel, stride, padding)
     initialize_convolution(layer, in_channels * kernel**2)
     return layer
+
+
+def initialize_convolution(layer: nn.Conv2d | nn.ConvTranspose2d, fan_in: int) -> None:
+    """Fill a convolution with the reference's initial weights and a zero bias, in channels-last layout."""
+    initialize(layer.weight, fan_in)
+    layer.weight.data = layer.weight.data.contiguous(memory_format=torch.channels_last)
+    assert layer.bias is not None
+    nn.init.zeros_(layer.bias)
 
 
 def fold_patches(images: Tensor, patch: int) -> Tensor:
@@ -84,12 +87,7 @@ class ImageEncoder(nn.Module):
     """Convolutions that halve the image, each followed by normalisation over channels and SiLU.
 
     Args:
-        depth: Channels of a stage are ``depth * multiplier``.
-        multipliers: One for each stage, which halves the image.
-        kernel: Kernel size, pixels.
-        strided: Halve by stride 2 rather than by a 2×2 max-pool; four times fewer FLOPs.
-        norm: ``"rms"`` or ``"layer"``.
-        patch: Side of the pixel blocks that are folded into channels before the first stage; 1 folds nothing.
+        size: Sizes of the networks.
         image_size: Height and width of the images, pixels.
 
     Raises:
@@ -97,44 +95,29 @@ class ImageEncoder(nn.Module):
 
     Example:
         >>> import torch
-        >>> encoder = ImageEncoder(depth=4)
+        >>> from dreamer_racing.modules import get_size
+        >>> encoder = ImageEncoder(get_size("debug"))
         >>> encoder(torch.zeros(2, 64, 64, 3, dtype=torch.uint8)).shape
-        torch.Size([2, 256])
+        torch.Size([2, 128])
 
     Reference: danijar/dreamerv3, ``rssm.Encoder``.
     """
 
-    def __init__(
-        self,
-        depth: int,
-        multipliers: Sequence[int] = (2, 3, 4, 4),
-        kernel: int = 5,
-        strided: bool = False,
-        norm: str = "rms",
-        patch: int = 1,
-        image_size: int = 64,
-    ) -> None:
+    def __init__(self, size: ModelSize, image_size: int = 64) -> None:
         super().__init__()
-        self.patch = patch
-        channels = [depth * multiplier for multiplier in multipliers]
-        stride = 2 if strided else 1
+        self.patch = size.cnn_patch
+        channels = [size.cnn_depth * multiplier for multiplier in size.cnn_multipliers]
+        stride = 2 if size.strided else 1
         self.convolutions = nn.ModuleList(
-            make_convolution(before, after, kernel, stride)
-            for before, after in zip([3 * patch**2, *channels[:-1]], channels, strict=True)
+            make_convolution(before, after, size.cnn_kernel, stride)
+            for before, after in pairwise([3 * self.patch**2, *channels])
         )
-        self.norms = nn.ModuleList(NORMS[norm](count) for count in channels)
-        self.pool = nn.Identity() if strided else nn.MaxPool2d(2)
-        self.embedding_size = smallest_map(image_size, patch, len(channels)) ** 2 * channels[-1]
+        self.norms = nn.ModuleList(NORMS[size.norm](count) for count in channels)
+        self.pool = nn.Identity() if size.strided else nn.MaxPool2d(2)
+        self.embedding_size = smallest_map(image_size, self.patch, len(channels)) ** 2 * channels[-1]
 
     def forward(self, pixels: Tensor) -> Tensor:
-        """Embed images.
-
-        Args:
-            pixels: uint8 ``(..., height, width, 3)``.
-
-        Returns:
-            float32 ``(..., E)``.
-        """
+        """Map images uint8 ``(..., height, width, 3)`` to embeddings float32 ``(..., E)``."""
         batch = pixels.shape[:-3]
         # Channels-last throughout: (N, H, W, C) in memory, (N, C, H, W) to the convolutions.
         images = _centred(fold_patches(pixels.flatten(0, -4), self.patch))
@@ -145,13 +128,7 @@ class ImageEncoder(nn.Module):
 
 
 class VectorEncoder(nn.Module):
-    """Encoder of vectors: hidden layers on their symlog.
-
-    Args:
-        inputs: V.
-        layers: Number of hidden layers.
-        units: Their width, E.
-        norm: ``"rms"`` or ``"layer"``.
+    """Encoder of vectors: hidden layers, of width E, on their symlog.
 
     Reference: danijar/dreamerv3, ``rssm.Encoder``: symlog inputs, 3 layers.
     """
@@ -170,10 +147,6 @@ class VectorEncoder(nn.Module):
 class ObservationEncoder(nn.Module):
     """Encoder of all observations: the embeddings of the image and vector encoders side by side.
 
-    Args:
-        size: Sizes of the networks.
-        interface: Observations of the agent.
-
     Attributes:
         keys: Keys that ``forward`` reads, images first.
         embedding_size: E.
@@ -184,15 +157,7 @@ class ObservationEncoder(nn.Module):
         self.keys = interface.observation_keys
         encoders: dict[str, ImageEncoder | VectorEncoder] = {}
         if interface.pixels:
-            encoders[PIXELS] = ImageEncoder(
-                size.cnn_depth,
-                size.cnn_multipliers,
-                size.cnn_kernel,
-                size.strided,
-                size.norm,
-                size.cnn_patch,
-                interface.image_size,
-            )
+            encoders[PIXELS] = ImageEncoder(size, interface.image_size)
         if interface.vector_dim:
             encoders[interface.vector_key] = VectorEncoder(
                 interface.vector_dim, size.vector_layers, size.units, size.norm
@@ -201,14 +166,7 @@ class ObservationEncoder(nn.Module):
         self.encoders = nn.ModuleDict(encoders)
 
     def forward(self, observation: Mapping[str, Tensor]) -> Tensor:
-        """Embed observations.
-
-        Args:
-            observation: The tensors under ``keys``, ``(..., *)``.
-
-        Returns:
-            float32 ``(..., E)``.
-        """
+        """Map the tensors under ``keys``, ``(..., *)``, to one embedding float32 ``(..., E)``."""
         embeddings = [encoder(observation[key]) for key, encoder in self.encoders.items()]
         return embeddings[0] if len(embeddings) == 1 else torch.cat(embeddings, -1)
 
@@ -216,10 +174,10 @@ class ObservationEncoder(nn.Module):
 class DenseProjection(nn.Module):
     """One linear layer from belief and state to the smallest feature map (2023)."""
 
-    def __init__(self, belief: int, state: int, resolution: int, channels: int) -> None:
+    def __init__(self, size: ModelSize, resolution: int, channels: int) -> None:
         super().__init__()
         self.shape = (resolution, resolution, channels)
-        self.linear = linear(belief + state, resolution**2 * channels)
+        self.linear = linear(size.features, resolution**2 * channels)
 
     def forward(self, belief: Tensor, state: Tensor) -> Tensor:
         """Map ``(N, belief)`` and ``(N, state)`` to ``(N, height, width, C)``."""
@@ -229,15 +187,13 @@ class DenseProjection(nn.Module):
 class BlockProjection(nn.Module):
     """Block-diagonal layer for the belief, one channel group per block, plus two layers for the state (2025)."""
 
-    def __init__(
-        self, belief: int, state: int, resolution: int, channels: int, blocks: int, units: int, norm: str
-    ) -> None:
+    def __init__(self, size: ModelSize, resolution: int, channels: int) -> None:
         super().__init__()
         self.shape = (resolution, resolution, channels)
-        self.blocks = blocks
-        self.from_belief = BlockLinear(belief, resolution**2 * channels, blocks)
+        self.blocks = size.blocks
+        self.from_belief = BlockLinear(size.belief, resolution**2 * channels, size.blocks)
         self.from_state = nn.Sequential(
-            NormedLinear(state, 2 * units, norm), linear(2 * units, resolution**2 * channels)
+            NormedLinear(size.state, 2 * size.units, size.norm), linear(2 * size.units, resolution**2 * channels)
         )
 
     def forward(self, belief: Tensor, state: Tensor) -> Tensor:
@@ -276,16 +232,7 @@ class ImageDecoder(nn.Module):
     """Image decoder, mirror of ``ImageEncoder``: a projection to the smallest map, then doublings up to the image.
 
     Args:
-        belief: Width of h.
-        state: Width of z.
-        units: Width of the state's hidden layer is ``2 * units``; used with more than one block.
-        depth: Channels of a stage are ``depth * multiplier``.
-        multipliers: One per stage, from the image inwards (the encoder's order).
-        kernel: Kernel size, pixels.
-        strided: Use transposed convolutions of stride 2 rather than nearest upsampling.
-        blocks: Blocks of the belief's projection; 1 projects belief and state densely.
-        norm: ``"rms"`` or ``"layer"``.
-        patch: Side of the pixel blocks that are unfolded from channels after the last stage; 1 unfolds nothing.
+        size: Sizes of the networks; ``blocks`` of 1 projects belief and state densely.
         image_size: Height and width of the images, pixels.
 
     Raises:
@@ -294,57 +241,27 @@ class ImageDecoder(nn.Module):
     Reference: danijar/dreamerv3, ``rssm.Decoder``.
     """
 
-    def __init__(
-        self,
-        belief: int,
-        state: int,
-        units: int,
-        depth: int,
-        multipliers: Sequence[int] = (2, 3, 4, 4),
-        kernel: int = 5,
-        strided: bool = False,
-        blocks: int = 8,
-        norm: str = "rms",
-        patch: int = 1,
-        image_size: int = 64,
-    ) -> None:
+    def __init__(self, size: ModelSize, image_size: int = 64) -> None:
         super().__init__()
-        self.patch = patch
+        self.patch = size.cnn_patch
         self.image_size = image_size
-        channels = [depth * multiplier for multiplier in reversed(multipliers)]
-        resolution = smallest_map(image_size, patch, len(channels))
-        self.projection: nn.Module = (
-            BlockProjection(belief, state, resolution, channels[0], blocks, units, norm)
-            if blocks > 1
-            else DenseProjection(belief, state, resolution, channels[0])
-        )
-        convolution = StridedConvolution if strided else UpsampledConvolution
-        self.norms = nn.ModuleList(NORMS[norm](count) for count in channels)
+        channels = [size.cnn_depth * multiplier for multiplier in reversed(size.cnn_multipliers)]
+        resolution = smallest_map(image_size, self.patch, len(channels))
+        projection = BlockProjection if size.blocks > 1 else DenseProjection
+        self.projection = projection(size, resolution, channels[0])
+        convolution = StridedConvolution if size.strided else UpsampledConvolution
+        self.norms = nn.ModuleList(NORMS[size.norm](count) for count in channels)
         self.convolutions = nn.ModuleList(
-            convolution(before, after, kernel)
-            for before, after in zip(channels, [*channels[1:], 3 * patch**2], strict=True)
+            convolution(before, after, size.cnn_kernel) for before, after in pairwise([*channels, 3 * self.patch**2])
         )
 
     def forward(self, belief: Tensor, state: Tensor) -> Tensor:
-        """Predict images.
-
-        Args:
-            belief: ``(..., belief)``.
-            state: ``(..., state)``.
-
-        Returns:
-            Mean of the image in [0, 1], ``(..., height, width, 3)``.
-        """
+        """Map ``(..., belief)`` and ``(..., state)`` to the mean image in [0, 1], ``(..., height, width, 3)``."""
         images = unfold_patches(self._folded(belief, state), self.patch)
         return images.reshape(*belief.shape[:-1], self.image_size, self.image_size, 3)
 
     def squared_error(self, belief: Tensor, state: Tensor, pixels: Tensor) -> Tensor:
-        """Compare predicted images with true ones, without unfolding the pixel blocks.
-
-        Args:
-            belief: ``(..., belief)``.
-            state: ``(..., state)``.
-            pixels: uint8 ``(..., height, width, 3)``.
+        """Compare predicted images with true ones, uint8 ``(..., height, width, 3)``; pixel blocks stay folded.
 
         Returns:
             Mean over batch, pixels and channels of the squared error of values in [0, 1], a scalar.
@@ -361,14 +278,7 @@ class ImageDecoder(nn.Module):
 
 
 class VectorDecoder(nn.Module):
-    """Decoder of vectors: hidden layers that predict their symlog.
-
-    Args:
-        features: F.
-        outputs: V.
-        layers: Number of hidden layers.
-        units: Their width.
-        norm: ``"rms"`` or ``"layer"``.
+    """Decoder of vectors: hidden layers on the features that predict the vectors' symlog.
 
     Reference: danijar/dreamerv3, ``rssm.Decoder``: symlog squared error.
     """

@@ -9,7 +9,7 @@ casts all weights, and another casts their gradients back.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from typing import Any
 
@@ -35,18 +35,21 @@ def use_few_kernels(module: nn.Module) -> None:
 def cast_once(module: nn.Module, dtype: torch.dtype) -> Iterator[None]:
     """Make the layers of a module use casted copies of their parameters; gradients flow to the originals.
 
-    If a parameter is used several times, its gradients are summed in the type of the copies.
-
-    Args:
-        module: Module that runs under autocast, which then only has to cast activations.
-        dtype: Type of the copies.
+    Autocast then only has to cast activations. If a parameter is used several times, its gradients are summed in the
+    type of the copies.
     """
     layers = {layer: None for layer in module.modules() if isinstance(layer, LAYERS)}
     held = [(layer, name, p) for layer in layers for name, p in layer._parameters.items() if p is not None]
-    copies = _Cast.apply(dtype, *(parameter for _, _, parameter in held))
+    with replaced(held, _Cast.apply(dtype, *(parameter for _, _, parameter in held))):
+        yield
+
+
+@contextmanager
+def replaced(held: Sequence[tuple[nn.Module, str, nn.Parameter]], others: Sequence[Tensor]) -> Iterator[None]:
+    """Put other tensors in the place of parameters, each given with its module and name; put these back at the end."""
     # Not by attribute assignment, which accepts only parameters in place of a parameter.
-    for (layer, name, _), copy in zip(held, copies, strict=True):
-        layer._parameters[name] = copy
+    for (layer, name, _), other in zip(held, others, strict=True):
+        layer._parameters[name] = other  # type: ignore[assignment]
     try:
         yield
     finally:
@@ -69,7 +72,7 @@ class _Cast(Function):
         return None, *(None if gradient is None else next(cast) for gradient in gradients)
 
 
-def _cast(tensors: list[Tensor] | tuple[Tensor, ...], dtype: torch.dtype) -> list[Tensor]:
+def _cast(tensors: Sequence[Tensor], dtype: torch.dtype) -> list[Tensor]:
     copies = [torch.empty_like(tensor, dtype=dtype) for tensor in tensors]
     if copies:
         torch._foreach_copy_(copies, list(tensors))

@@ -41,8 +41,8 @@ class MLP(nn.Module):
     Args:
         in_features: F.
         out_features: Width of the output.
-        layers: Number of hidden layers.
-        units: Width of the hidden layers.
+        layers: Number of hidden layers, as in all heads.
+        units: Their width.
         norm: ``"rms"`` or ``"layer"``.
         output_scale: Multiplier of the output layer's initial weights; 0 makes the first outputs zero.
     """
@@ -96,13 +96,9 @@ class TwoHot(nn.Module):
         self.register_buffer("values", torch.cat((-positive[1:].flip(0), positive)), persistent=False)
 
     def encode(self, target: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the two bins around each number and their weights.
+        """Map numbers ``(..., 1)`` to the indices of the two bins around each and their weights, ``(..., 2)`` each.
 
-        Args:
-            target: Numbers, ``(..., 1)``; those beyond the outermost bins are clamped to them.
-
-        Returns:
-            Bin indices, int64 ``(..., 2)``, and weights that sum to 1, ``(..., 2)``.
+        Numbers beyond the outermost bins are clamped to them.
         """
         target = target.clamp(self.values[0], self.values[-1])
         upper = torch.searchsorted(self.values, target.contiguous()).clamp_(1, len(self.values) - 1)
@@ -121,29 +117,13 @@ class TwoHot(nn.Module):
         return (difference * self.values[half + 1 :]).sum(-1, keepdim=True)
 
     def cross_entropy(self, log_probabilities: Tensor, target: Tensor) -> Tensor:
-        """Return −Σ two_hot(target)·log p.
-
-        Args:
-            log_probabilities: Log-softmax of the logits, ``(..., K)``.
-            target: Numbers, ``(..., 1)``.
-
-        Returns:
-            Loss, nats, ``(..., 1)``.
-        """
+        """Map log-softmaxes ``(..., K)`` and numbers ``(..., 1)`` to −Σ two_hot(target)·log p, nats ``(..., 1)``."""
         index, weight = self.encode(target)
         return -(log_probabilities.gather(-1, index) * weight).sum(-1, keepdim=True)
 
 
 class TwoHotHead(nn.Module):
-    """MLP whose output is a two-hot distribution; its initial prediction is zero.
-
-    Args:
-        in_features: F.
-        layers: Number of hidden layers.
-        units: Width of the hidden layers.
-        norm: ``"rms"`` or ``"layer"``.
-        bins: K.
-    """
+    """MLP whose output is a two-hot distribution over K ``bins``; its initial prediction is zero."""
 
     def __init__(self, in_features: int, layers: int, units: int, norm: str = "rms", bins: int = 255) -> None:
         super().__init__()
@@ -178,13 +158,6 @@ class ContinueHead(nn.Module):
 class Critic(nn.Module):
     """Critic: predicts the distribution of the return, and has a slow copy, an exponential average of its weights.
 
-    Args:
-        in_features: F.
-        layers: Number of hidden layers.
-        units: Width of the hidden layers.
-        norm: ``"rms"`` or ``"layer"``.
-        bins: K.
-
     Reference: DreamerV3, "Critic learning"; the slow copy regularises the critic and does not compute its targets.
     """
 
@@ -213,11 +186,7 @@ class Critic(nn.Module):
 
     @torch.no_grad()
     def update_slow(self, rate: float) -> None:
-        """Move the slow copy towards the critic: slow ← (1 − rate)·slow + rate·fast.
-
-        Args:
-            rate: Fraction moved, in (0, 1].
-        """
+        """Move the slow copy towards the critic: slow ← (1 − rate)·slow + rate·fast."""
         torch._foreach_lerp_(list(self.slow_head.parameters()), list(self.head.parameters()), rate)
 
 
@@ -281,9 +250,7 @@ class Actor(nn.Module):
     Args:
         in_features: F.
         action_dim: A.
-        layers: Number of hidden layers.
-        units: Width of the hidden layers.
-        norm: ``"rms"`` or ``"layer"``.
+        layers: As of `MLP`, like ``units`` and ``norm``.
         min_std: Smallest standard deviation; a buffer that may change during training.
         max_std: Largest standard deviation; likewise.
         state_std: Whether the standard deviation depends on the state; if not, it is one learned number for each
@@ -326,9 +293,8 @@ class Actor(nn.Module):
     def _with_few_kernels(self, output: Tensor) -> ActionDistribution:
         """Map the MLP's output ``(..., 2·A)`` or ``(..., A)`` of any type to the distribution, as ``forward`` does."""
         output = output + self.shift  # in float32
-        mean, shifted = output.chunk(2, -1) if self.raw_std is None else (output, self._shifted_std(output))
+        if self.raw_std is None:
+            mean, shifted = output.chunk(2, -1)
+        else:
+            mean, shifted = output, (self.raw_std + STD_SHIFT).expand_as(output)
         return ActionDistribution(torch.tanh(mean), torch.lerp(self.min_std, self.max_std, torch.sigmoid(shifted)))
-
-    def _shifted_std(self, like: Tensor) -> Tensor:
-        assert self.raw_std is not None
-        return (self.raw_std + STD_SHIFT).expand_as(like)

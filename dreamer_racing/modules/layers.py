@@ -53,28 +53,12 @@ def initialize(weight: Tensor, fan_in: int, scale: float = 1.0) -> None:
     nn.init.trunc_normal_(weight, std=std, a=-2 * std, b=2 * std)
 
 
-class PerStepParameter:
-    """Parameter for the steps of one loop, whose gradients are summed once after the loop instead of step by step.
-
-    Args:
-        parameter: Any shape.
-        steps: Length of the loop.
-    """
-
-    def __init__(self, parameter: Tensor, steps: int) -> None:
-        self._left = iter(parameter.expand(steps, *parameter.shape).unbind(0))
-
-    def take(self) -> Tensor:
-        """Return the parameter for the next step."""
-        return next(self._left)
-
-
 class Linear(nn.Linear):
     """Linear layer whose weight gradient can be deferred until after a time loop; see ``unrolled``."""
 
     deferred: DeferredWeight | None = None
 
-    def defer(self, with_bias: bool = True) -> DeferredWeight:
+    def defer(self, with_bias: bool) -> DeferredWeight:
         """Return weight and bias for the steps of one loop; the bias costs no kernel, so it is always included."""
         return DeferredWeight(self.weight.mT, self.bias)
 
@@ -90,14 +74,7 @@ class Linear(nn.Linear):
 
 
 def linear(in_features: int, out_features: int, bias: bool = True, scale: float = 1.0) -> Linear:
-    """Make a linear layer with the reference's initial weights and a zero bias.
-
-    Args:
-        in_features: I.
-        out_features: O.
-        bias: Whether the layer has a bias.
-        scale: Multiplier of the initial weights.
-    """
+    """Make a linear layer with the reference's initial weights, times ``scale``, and a zero bias."""
     layer = Linear(in_features, out_features, bias=bias)
     initialize(layer.weight, in_features, scale)
     if bias:
@@ -105,30 +82,14 @@ def linear(in_features: int, out_features: int, bias: bool = True, scale: float 
     return layer
 
 
-def initialize_convolution(layer: nn.Conv2d | nn.ConvTranspose2d, fan_in: int) -> None:
-    """Fill a convolution with the reference's initial weights and a zero bias, in channels-last layout.
-
-    Args:
-        layer: Convolution with a bias.
-        fan_in: Inputs that each output sums over.
-    """
-    initialize(layer.weight, fan_in)
-    layer.weight.data = layer.weight.data.contiguous(memory_format=torch.channels_last)
-    if layer.bias is not None:
-        nn.init.zeros_(layer.bias)
-
-
 class RMSNorm(nn.Module):
     """Divide features by their root mean square, then scale them (no shift).
-
-    Args:
-        features: Size of the last dimension.
 
     Reference: Zhang & Sennrich 2019; used by the 2025 DreamerV3.
     """
 
     shifts = False
-    of_steps: dict[str, PerStepParameter] | None = None  # see ``unrolled``
+    of_steps: dict[str, Iterator[Tensor]] | None = None  # see ``unrolled``
 
     def __init__(self, features: int) -> None:
         super().__init__()
@@ -136,7 +97,7 @@ class RMSNorm(nn.Module):
 
     def forward(self, inputs: Tensor) -> Tensor:
         """Normalise ``(..., features)`` over its last dimension."""
-        weight = self.weight if self.of_steps is None else self.of_steps["weight"].take()
+        weight = self.weight if self.of_steps is None else next(self.of_steps["weight"])
         # Under autocast, the cast avoids mixed types, which the fused kernel does not support.
         with in_own_type(inputs):
             return F.rms_norm(inputs, weight.shape, weight.to(inputs.dtype), NORM_EPS)
@@ -146,7 +107,7 @@ class LayerNorm(nn.LayerNorm):
     """Layer normalisation of the 2023 DreamerV3; on CPU one fused kernel, 4-9 times faster than RMS backward."""
 
     shifts = True
-    of_steps: dict[str, PerStepParameter] | None = None  # see ``unrolled``
+    of_steps: dict[str, Iterator[Tensor]] | None = None  # see ``unrolled``
 
     def __init__(self, features: int) -> None:
         super().__init__(features, eps=NORM_EPS)
@@ -156,7 +117,7 @@ class LayerNorm(nn.LayerNorm):
         weight: Tensor = self.weight
         bias: Tensor = self.bias
         if self.of_steps is not None:
-            weight, bias = (self.of_steps[name].take() for name in ("weight", "bias"))
+            weight, bias = (next(self.of_steps[name]) for name in ("weight", "bias"))
         if inputs.device.type != "cpu":  # the CPU's kernel accepts float32 with bfloat16
             weight, bias = weight.to(inputs.dtype), bias.to(inputs.dtype)
         with in_own_type(inputs):
@@ -177,15 +138,7 @@ NORMS: dict[str, type[RMSNorm] | type[LayerNorm]] = {"rms": RMSNorm, "layer": La
 
 
 class NormedLinear(nn.Module):
-    """Linear layer, normalisation, SiLU.
-
-    The linear layer has a bias only if the normalisation has no shift.
-
-    Args:
-        in_features: I.
-        out_features: O.
-        norm: Key of ``NORMS``.
-    """
+    """Linear layer, which has a bias only if the normalisation has no shift; normalisation (key of `NORMS`); SiLU."""
 
     def __init__(self, in_features: int, out_features: int, norm: str) -> None:
         super().__init__()
@@ -201,12 +154,6 @@ class SplitNormedLinear(nn.Module):
     """``NormedLinear`` of two concatenated inputs, whose second product can be computed before a time loop.
 
     W·[a, b] = W_a·a + W_b·b: ``project`` returns W_b·b (plus bias) for a whole sequence at once.
-
-    Args:
-        first_features: Size of a.
-        second_features: Size of b.
-        out_features: O.
-        norm: Key of ``NORMS``.
     """
 
     def __init__(self, first_features: int, second_features: int, out_features: int, norm: str) -> None:
@@ -236,7 +183,7 @@ class BlockLinear(nn.Module):
         out_features: O, divisible by ``blocks``.
         blocks: G.
         fan_in: Inputs that each output sums over, if other layers add to this layer's output; default I / G.
-        bias: Whether the layer has a bias.
+        bias: Whether there is one.
 
     Raises:
         ValueError: If a size is not divisible by ``blocks``.
@@ -255,7 +202,7 @@ class BlockLinear(nn.Module):
         self.bias = nn.Parameter(torch.zeros(out_features)) if bias else None
         initialize(self.weight, fan_in or in_features // blocks)
 
-    def defer(self, with_bias: bool = False) -> DeferredWeight:
+    def defer(self, with_bias: bool) -> DeferredWeight:
         """Return the weight for the steps of one loop, and the bias if ``with_bias``."""
         bias = self.bias.view(self.blocks, 1, -1) if with_bias and self.bias is not None else None
         return DeferredWeight(self.weight, bias)
@@ -274,22 +221,22 @@ class BlockLinear(nn.Module):
 def unrolled(*modules: nn.Module, steps: int | None = None) -> Iterator[None]:
     """Defer the weight gradients of linear layers that a time loop calls until after the loop.
 
-    Gradients differ only by rounding. Does nothing if gradients are disabled.
+    Gradients differ only by rounding. It does nothing if gradients are disabled.
 
     Args:
         modules: Modules that the loop calls, with each layer once per step.
         steps: Length of the loop, to defer the gradients of gains and biases, too (fewer kernels); None does not.
     """
-    inside = [layer for module in modules for layer in module.modules()]
-    if not torch.is_grad_enabled():
-        inside = []
+    inside = [layer for module in modules for layer in module.modules()] if torch.is_grad_enabled() else []
     layers = [layer for layer in inside if isinstance(layer, (Linear, BlockLinear))]
     norms = [layer for layer in inside if steps and isinstance(layer, (RMSNorm, LayerNorm))]
     for layer in layers:
         layer.deferred = layer.defer(with_bias=steps is not None) if layer.weight.requires_grad else None
-    for norm in norms:
+    for norm in norms:  # gains and biases are expanded, so that their gradients are summed once
         norm.of_steps = {
-            name: PerStepParameter(gain, steps or 0) for name, gain in norm._parameters.items() if gain is not None
+            name: iter(gain.expand(steps or 0, *gain.shape).unbind(0))
+            for name, gain in norm._parameters.items()
+            if gain is not None
         }
     try:
         yield

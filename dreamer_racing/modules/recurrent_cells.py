@@ -14,6 +14,7 @@ from torch.autograd import Function
 from torch.autograd.function import FunctionCtx
 
 from dreamer_racing.modules.layers import NORMS, BlockLinear, NormedLinear, SplitNormedLinear, linear
+from dreamer_racing.modules.sizes import ModelSize
 
 UPDATE_SHIFT = 1.0
 """Subtracted from the update gate, so that an untrained cell remembers rather than overwrites."""
@@ -64,56 +65,33 @@ class GatedUpdate(Function):
         return of_gates.to(ctx.gate_type), None, of_belief
 
 
-class SplitInputCell(nn.Module):
-    """Recurrent cell with one normalised input layer for state and action; the action's part is computed beforehand.
+class DenseGRUCell(nn.Module):
+    """GRU of the 2023 DreamerV3: one dense layer before it, one normalised dense layer for its three gates.
+
+    State and action enter one normalised layer, whose part for the action is computed beforehand.
 
     Args:
-        state: S.
+        size: Sizes of the networks.
         action: A.
-        hidden: U.
-        norm: ``"rms"`` or ``"layer"``.
     """
 
-    def __init__(self, state: int, action: int, hidden: int, norm: str) -> None:
+    def __init__(self, size: ModelSize, action: int) -> None:
         super().__init__()
         self.action_dim = action
-        self.inputs = SplitNormedLinear(state, action, hidden, norm)
+        self.inputs = SplitNormedLinear(size.state, action, size.hidden, size.norm)
+        self.gates_norm = NORMS[size.norm](3 * size.belief)
+        self.gates = linear(size.hidden + size.belief, 3 * size.belief, bias=not self.gates_norm.shifts)
+        self.few_kernels = False
+        self.shift = nn.Buffer(gate_shift(), persistent=False)
 
     def project_action(self, action: Tensor) -> Tensor:
         """Map actions ``(..., A)`` to their part of the input layer ``(..., U)``."""
         return self.inputs.project(action)
 
-
-class DenseGRUCell(SplitInputCell):
-    """GRU of the 2023 DreamerV3: one dense layer before it, one normalised dense layer for its three gates.
-
-    Args:
-        belief: D.
-        state: S.
-        action: A.
-        hidden: U.
-        norm: ``"rms"`` or ``"layer"``.
-        blocks: Ignored; exists so that all cells have the same arguments.
-    """
-
-    def __init__(self, belief: int, state: int, action: int, hidden: int, norm: str, blocks: int = 1) -> None:
-        super().__init__(state, action, hidden, norm)
-        self.gates_norm = NORMS[norm](3 * belief)
-        self.gates = linear(hidden + belief, 3 * belief, bias=not self.gates_norm.shifts)
-        self.few_kernels = False
-        self.shift = nn.Buffer(gate_shift(), persistent=False)
-
     def forward(self, belief: Tensor, state: Tensor, projected_action: Tensor, low: Tensor | None = None) -> Tensor:
-        """Return the next belief.
+        """Return the next belief ``(N, D)``, from an action ``(N, U)`` of ``project_action``.
 
-        Args:
-            belief: ``(N, D)``.
-            state: ``(N, S)``.
-            projected_action: From ``project_action``, ``(N, U)``.
-            low: The belief in autocast's type, if it was cast already.
-
-        Returns:
-            ``(N, D)``.
+        ``low`` is the belief in autocast's type, if it was cast already.
         """
         inputs = self.inputs(state, projected_action)
         low = belief.to(inputs.dtype) if low is None else low
@@ -131,28 +109,25 @@ class BlockGRUCell(nn.Module):
     a dense layer on those inputs and a block-diagonal layer on the belief, which is computed here.
 
     Args:
-        belief: D, divisible by ``blocks``.
-        state: S.
+        size: Sizes of the networks; ``belief`` must be divisible by ``blocks``.
         action: A.
-        hidden: U.
-        norm: ``"rms"`` or ``"layer"``.
-        blocks: G.
 
     Reference: danijar/dreamerv3, ``rssm.RSSM._core``.
     """
 
-    def __init__(self, belief: int, state: int, action: int, hidden: int, norm: str, blocks: int = 8) -> None:
+    def __init__(self, size: ModelSize, action: int) -> None:
         super().__init__()
+        belief, hidden, norm = size.belief, size.hidden, size.norm
         self.action_dim = action
-        self.blocks = blocks
+        self.blocks = size.blocks
         self.from_belief = NormedLinear(belief, hidden, norm)
-        self.from_state = NormedLinear(state, hidden, norm)
+        self.from_state = NormedLinear(size.state, hidden, norm)
         self.from_action = NormedLinear(action, hidden, norm)
-        fan_in = belief // blocks + 3 * hidden
+        fan_in = belief // size.blocks + 3 * hidden
         self.hidden_shared = linear(3 * hidden, belief, scale=(3 * hidden / fan_in) ** 0.5)
-        self.hidden_blocks = BlockLinear(belief, belief, blocks, fan_in=fan_in, bias=False)
+        self.hidden_blocks = BlockLinear(belief, belief, size.blocks, fan_in=fan_in, bias=False)
         self.hidden_norm = NORMS[norm](belief)
-        self.gates = BlockLinear(belief, 3 * belief, blocks)
+        self.gates = BlockLinear(belief, 3 * belief, size.blocks)
         self.few_kernels = False
         self.shift = nn.Buffer(gate_shift(), persistent=False)
 

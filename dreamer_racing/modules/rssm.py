@@ -20,6 +20,7 @@ from torch.autograd.function import FunctionCtx
 
 from dreamer_racing.modules.layers import NormedLinear, SplitNormedLinear, autocast_type, linear, unrolled
 from dreamer_racing.modules.recurrent_cells import BlockGRUCell, DenseGRUCell
+from dreamer_racing.modules.sizes import ModelSize
 from dreamer_racing.settings import check_choice
 
 StepStart = Callable[[int, Tensor, Tensor], tuple[Tensor, ...]]
@@ -143,69 +144,45 @@ class RSSM(nn.Module):
     clipped to [−1, 1], as in the environment.
 
     Args:
+        size: Sizes of the networks.
         embedding: E.
         action: A.
-        belief: D.
-        latents: L.
-        classes: K.
-        hidden: U.
-        recurrence: Key of ``cells``.
-        blocks: Blocks of the block GRU.
-        prior_layers: Hidden layers from h to the prior's logits.
-        norm: ``"rms"`` or ``"layer"``.
-        learned_initial: Whether the initial belief is learned (then the initial state is the prior's mode) or zero.
-        unimix: Share of the uniform distribution in every categorical.
-        sampled: Whether a state is a sample of its categoricals, as in DreamerV3, or their probabilities themselves, so
-            that latents are deterministic in acting, training and imagination.
 
     Raises:
-        ValueError: If there is no cell of that name.
+        ValueError: If the size has an unknown ``recurrence``.
 
     Example:
         >>> import torch
-        >>> rssm = RSSM(embedding=8, action=4, belief=16, latents=2, classes=4, hidden=8)
+        >>> from dreamer_racing.modules import get_size
+        >>> rssm = RSSM(get_size("debug"), embedding=8, action=4)
         >>> posterior = rssm.observe(torch.zeros(2, 5, 8), torch.zeros(2, 5, 4), torch.zeros(2, 5, dtype=torch.bool))
         >>> posterior.state.shape
-        torch.Size([2, 5, 8])
+        torch.Size([2, 5, 16])
 
     Reference: danijar/dreamerv3, ``rssm.RSSM``; DreamerV3, Eq. 3.
     """
 
     cells: ClassVar[dict[str, Any]] = {"block": BlockGRUCell, "dense": DenseGRUCell}
     """Recurrent cells by ``ModelSize.recurrence``."""
+    unimix = 0.01
+    """Share of the uniform distribution in every categorical."""
 
-    def __init__(
-        self,
-        embedding: int,
-        action: int,
-        belief: int,
-        latents: int,
-        classes: int,
-        hidden: int,
-        recurrence: str = "block",
-        blocks: int = 8,
-        prior_layers: int = 2,
-        norm: str = "rms",
-        learned_initial: bool = False,
-        unimix: float = 0.01,
-        sampled: bool = True,
-    ) -> None:
+    def __init__(self, size: ModelSize, embedding: int, action: int) -> None:
         super().__init__()
-        check_choice("RSSM: recurrence", recurrence, self.cells)
-        self.latents, self.classes, self.unimix, self.sampled = latents, classes, unimix, sampled
+        check_choice(f"model size {size.name}: recurrence", size.recurrence, self.cells)
+        self.latents, self.classes, self.sampled = size.latents, size.classes, size.sampled
         self.few_kernels = False
-        self.uniform = nn.Buffer(torch.tensor(1.0 / classes), persistent=False)
-        state = latents * classes
-        self.cell = self.cells[recurrence](belief, state, action, hidden, norm, blocks)
-        widths = [belief] + [hidden] * prior_layers
+        self.uniform = nn.Buffer(torch.tensor(1.0 / size.classes), persistent=False)
+        self.cell = self.cells[size.recurrence](size, action)
+        widths = [size.belief] + [size.hidden] * size.prior_layers
         self.prior = nn.Sequential(
-            *(NormedLinear(before, after, norm) for before, after in pairwise(widths)),
-            linear(hidden, state),
+            *(NormedLinear(before, after, size.norm) for before, after in pairwise(widths)),
+            linear(size.hidden, size.state),
         )
-        self.posterior_hidden = SplitNormedLinear(belief, embedding, hidden, norm)
-        self.posterior_output = linear(hidden, state)
-        self.learned_initial = learned_initial
-        self.initial_belief = nn.Parameter(torch.zeros(1, belief), requires_grad=learned_initial)
+        self.posterior_hidden = SplitNormedLinear(size.belief, embedding, size.hidden, size.norm)
+        self.posterior_output = linear(size.hidden, size.state)
+        self.learned_initial = size.learned_initial
+        self.initial_belief = nn.Parameter(torch.zeros(1, size.belief), requires_grad=size.learned_initial)
 
     def initial(self) -> tuple[Tensor, Tensor]:
         """Return the belief ``(1, D)`` and state ``(1, S)`` before an episode's first observation."""
@@ -243,9 +220,6 @@ class RSSM(nn.Module):
             is_init: Whether each observation is its episode's first, bool ``(B, T)``.
             initial: Belief ``(B, D)`` and state ``(B, S)`` before the sequence; by default those of an episode's start.
             deterministic: Take the posterior's mode instead of a sample.
-
-        Returns:
-            Belief, state and logits of every step.
         """
         batch, time = is_init.shape
         start = self.initial()
@@ -254,17 +228,20 @@ class RSSM(nn.Module):
         actions = self._project_action(previous_action, resets).unbind(1)
         embeddings = self.posterior_hidden.project(embedding).unbind(1)
         noises = [None] * time if deterministic else self.draw_noise(time, batch).unbind(0)
-        dtype = self._state_type(belief)
+        # Autocast's type represents one-hots exactly.
+        low = autocast_type(belief.device.type) if self.few_kernels and self.sampled else None
+        dtype = low or belief.dtype
         begin = self._begin_steps(resets, (start[0], start[1].to(dtype)))
         beliefs, states, logits = [], [], []
         steps = time if self.few_kernels else None
         with unrolled(self.cell, self.posterior_hidden, self.posterior_output, steps=steps):
             for at, (action, embedded, noise) in enumerate(zip(actions, embeddings, noises, strict=True)):
                 belief, state = begin(at, belief, state)
-                belief, state, logit = self._observe(belief, state, action, embedded, noise, dtype)
+                belief = self.cell(belief, state, action)
+                logits.append(self._posterior_logits(belief, embedded))
+                state = self._sample(logits[-1], noise, dtype=dtype)
                 beliefs.append(belief)
                 states.append(state)
-                logits.append(logit)
         belief = torch.stack(beliefs, 1)
         state = torch.stack(states, 1).float()
         return Posterior(belief, state, torch.stack(logits, 1), self.prior_logits(belief))
@@ -278,7 +255,7 @@ class RSSM(nn.Module):
         state: Tensor,
         deterministic: bool = False,
     ) -> tuple[Tensor, Tensor]:
-        """Update the latents by one observation, for acting; the same maths as one step of ``observe``.
+        """Return belief and state after one more observation, for acting; the same maths as one step of ``observe``.
 
         Args:
             embedding: ``(N, E)``.
@@ -287,9 +264,6 @@ class RSSM(nn.Module):
             belief: The previous belief, ``(N, D)``.
             state: The previous state, ``(N, S)``.
             deterministic: Take the posterior's mode instead of a sample.
-
-        Returns:
-            Belief ``(N, D)`` and state ``(N, S)``.
         """
         belief = self.advance(previous_action, is_init, belief, state)
         return belief, self.posterior_state(belief, embedding, deterministic)
@@ -312,25 +286,17 @@ class RSSM(nn.Module):
     def imagine_step(
         self, belief: Tensor, state: Tensor, action: Tensor, deterministic: bool = False
     ) -> tuple[Tensor, Tensor]:
-        """Predict one step without an observation.
+        """Predict belief ``(N, D)`` and state ``(N, S)`` of the next step without an observation.
 
         Args:
             belief: ``(N, D)``.
             state: ``(N, S)``.
             action: ``(N, A)``.
             deterministic: Take the prior's mode instead of a sample.
-
-        Returns:
-            The next belief ``(N, D)`` and state ``(N, S)``.
         """
         belief = self.cell(belief, state, self.cell.project_action(action.clamp(-1.0, 1.0)))
         noise = None if deterministic else self.draw_noise(len(belief))
         return belief, self._sample(self.prior_logits(belief), noise)
-
-    def _state_type(self, belief: Tensor) -> torch.dtype:
-        """Return the type of states in the time loop; autocast's type represents one-hots exactly."""
-        low = autocast_type(belief.device.type) if self.few_kernels and self.sampled else None
-        return low or belief.dtype
 
     def _begin_steps(self, resets: Tensor, start: tuple[Tensor, Tensor]) -> StepStart:
         """Return the function that replaces the latents before a step by an episode's start where it is reset.
@@ -352,17 +318,10 @@ class RSSM(nn.Module):
     def imagine_few_kernels(
         self, belief: Tensor, features: Tensor, action: Tensor, noise: Tensor, following: Tensor
     ) -> Tensor:
-        """Do the same as ``imagine_step``, but cast latents only once, and write them into a given tensor.
+        """Do the same as ``imagine_step``, but cast latents only once, and write the next ones to ``following``.
 
-        Args:
-            belief: ``(N, D)``.
-            features: Belief and state in autocast's type, ``(N, F)``.
-            action: ``(N, A)``.
-            noise: ``(N, L, 1)``.
-            following: Zeros of that type, ``(N, F)``, to which the next belief and state are written.
-
-        Returns:
-            The next belief, in the type of ``belief``.
+        It holds zeros, and like ``features`` belief and state in autocast's type, ``(N, F)``. The noise is
+        ``(N, L, 1)``. The next belief is also returned, in its own type.
         """
         width = belief.shape[-1]
         action = self.cell.project_action(action.clamp(-1.0, 1.0))
@@ -377,20 +336,6 @@ class RSSM(nn.Module):
     def _project_action(self, previous_action: Tensor, reset: Tensor) -> Tensor:
         """Clip actions ``(..., A)``, set them to zero where ``reset``, and project them."""
         return self.cell.project_action(previous_action.clamp(-1.0, 1.0).masked_fill(reset, 0.0))
-
-    def _observe(
-        self,
-        belief: Tensor,
-        state: Tensor,
-        projected_action: Tensor,
-        embedded: Tensor,
-        noise: Tensor | None,
-        dtype: torch.dtype | None = None,
-    ) -> tuple[Tensor, Tensor, Tensor]:
-        """Return the next belief ``(N, D)`` and state ``(N, S)`` with the posterior's logits ``(N, L, K)``."""
-        belief = self.cell(belief, state, projected_action)
-        logits = self._posterior_logits(belief, embedded)
-        return belief, self._sample(logits, noise, dtype=dtype), logits
 
     def _posterior_logits(self, belief: Tensor, embedded: Tensor) -> Tensor:
         """Map beliefs ``(..., D)`` and projected embeddings ``(..., U)`` to the posterior's logits ``(..., L, K)``."""

@@ -152,10 +152,7 @@ Appendix B, of which Dream to Fly uses L."""
 
 
 def get_size(size: ModelSize | str) -> ModelSize:
-    """Return the size of a name, or a given ``ModelSize`` as it is.
-
-    Args:
-        size: A ``ModelSize`` or a key of ``SIZES``.
+    """Return the size of a name, a key of ``SIZES``, or a given ``ModelSize`` as it is.
 
     Raises:
         ValueError: If no size has that name; the message lists the known names.

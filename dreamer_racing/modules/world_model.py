@@ -15,7 +15,6 @@ from dreamer_racing.modules.heads import ContinueHead, TwoHotHead
 from dreamer_racing.modules.interface import Interface
 from dreamer_racing.modules.rssm import RSSM, Posterior
 from dreamer_racing.modules.sizes import ModelSize, get_size
-from dreamer_racing.settings import check_choice
 
 
 class WorldModel(nn.Module):
@@ -47,22 +46,8 @@ class WorldModel(nn.Module):
         size, interface = get_size(size), interface or Interface()
         self.size, self.interface = size, interface
         self.encoder = ObservationEncoder(size, interface)
-        check_choice(f"model size {size.name}: recurrence", size.recurrence, RSSM.cells)
-        self.rssm = RSSM(
-            self.encoder.embedding_size,
-            interface.action_dim,
-            size.belief,
-            size.latents,
-            size.classes,
-            size.hidden,
-            recurrence=size.recurrence,
-            blocks=size.blocks,
-            prior_layers=size.prior_layers,
-            norm=size.norm,
-            learned_initial=size.learned_initial,
-            sampled=size.sampled,
-        )
-        self.decoder = self._image_decoder() if decode and interface.pixels else None
+        self.rssm = RSSM(size, self.encoder.embedding_size, interface.action_dim)
+        self.decoder = ImageDecoder(size, interface.image_size) if decode and interface.pixels else None
         self.vector_decoder = (
             VectorDecoder(size.features, interface.vector_dim, size.vector_layers, size.units, size.norm)
             if decode and interface.vector_dim
@@ -71,22 +56,6 @@ class WorldModel(nn.Module):
         self.reward_head = TwoHotHead(size.features, size.head_layers, size.units, size.norm, size.bins)
         self.continue_head = ContinueHead(size.features, size.head_layers, size.units, size.norm)
 
-    def _image_decoder(self) -> ImageDecoder:
-        size = self.size
-        return ImageDecoder(
-            size.belief,
-            size.state,
-            size.units,
-            size.cnn_depth,
-            size.cnn_multipliers,
-            size.cnn_kernel,
-            size.strided,
-            size.blocks,
-            size.norm,
-            size.cnn_patch,
-            self.interface.image_size,
-        )
-
     def observe(
         self,
         observation: Mapping[str, Tensor],
@@ -94,16 +63,13 @@ class WorldModel(nn.Module):
         is_init: Tensor,
         deterministic: bool = False,
     ) -> Posterior:
-        """Encode a sequence of records, and infer their latents.
+        """Encode a sequence of records, and infer their latents; see `RSSM.observe`.
 
         Args:
             observation: Observations by key: ``pixels`` uint8 ``(B, T, height, width, 3)``, ``vector`` ``(B, T, V)``.
             previous_action: ``(B, T, A)``.
             is_init: bool ``(B, T)``.
             deterministic: Take the posterior's mode instead of a sample.
-
-        Returns:
-            Belief, state and logits of every record.
         """
         return self.rssm.observe(self.encoder(observation), previous_action, is_init, deterministic=deterministic)
 
@@ -111,15 +77,9 @@ class WorldModel(nn.Module):
     def open_loop(
         self, observation: Mapping[str, Tensor], previous_action: Tensor, is_init: Tensor, context: int
     ) -> tuple[Tensor, Tensor]:
-        """Observe the first records, then predict the others from their actions alone.
+        """Observe the first ``context`` records, then predict the others from their actions alone.
 
-        Resets beyond the observed records are ignored.
-
-        Args:
-            observation: As for ``observe``; only the first ``context`` records are read.
-            previous_action: ``(B, T, A)``.
-            is_init: bool ``(B, T)``.
-            context: Number of records that are observed, at least 1.
+        Resets beyond the observed records are ignored. Arguments as for ``observe``.
 
         Returns:
             Beliefs ``(B, T, D)`` and states ``(B, T, S)``.
@@ -148,7 +108,7 @@ class WorldModel(nn.Module):
             actions: ``(B, H, A)``.
 
         Returns:
-            Beliefs ``(B, H, D)`` and states ``(B, H, S)``, one after each action.
+            Beliefs ``(B, H, D)`` and states ``(B, H, S)`` after each action.
         """
         beliefs, states = [belief], [state]
         for action in actions.unbind(1):

@@ -11,30 +11,15 @@ from dreamer_racing.learners.update import WorldModelLearner
 from dreamer_racing.losses import TARGETS
 from dreamer_racing.losses.policy import frozen
 from dreamer_racing.modules import Interface
-from dreamer_racing.modules.rssm import RSSM
-from tests.dreamers import imagine_from, latent_ppo_of, learner_of
+from tests.dreamers import imagine_from, latent_ppo_of, learner_of, make_windows, rssm_of
 
 PRIVILEGED_DIM = 5
 CONFIG = {"learning_rate": 1e-3, "warmup_updates": 0, "free_nats": 0.0}
 
 
-def make_batch(batch: int = 3, time: int = 5) -> TensorDict:
-    torch.manual_seed(1)
-    is_init, terminated, truncated = torch.zeros(3, batch, time, 1, dtype=torch.bool).unbind(0)
-    terminated[0, 1] = truncated[1, 2] = True
-    is_init[0, 2] = is_init[1, 3] = is_init[2, 0] = True
-    return TensorDict(
-        {
-            "pixels": torch.randint(0, 256, (batch, time, 64, 64, 3), dtype=torch.uint8),
-            "privileged": {"vector": torch.randn(batch, time, PRIVILEGED_DIM)},
-            "previous_action": torch.rand(batch, time, 4) * 2 - 1,
-            "reward": torch.randn(batch, time, 1),
-            "is_init": is_init,
-            "terminated": terminated,
-            "truncated": truncated,
-        },
-        [batch, time],
-    )
+def make_batch() -> TensorDict:
+    places = {"is_init": [(0, 2), (1, 3), (2, 0)], "terminated": [(0, 1)], "truncated": [(1, 2)]}
+    return make_windows(3, 5, **places, privileged=PRIVILEGED_DIM)
 
 
 def make_learner(actor: str = "reinforce", **options) -> WorldModelLearner:
@@ -211,7 +196,7 @@ def test_frozen_restores_flags_after_an_error():
 def test_gradients_of_an_unroll_are_those_of_its_steps(recurrence, monkeypatch):
     """Also across a reset, and with the same samples."""
     torch.manual_seed(0)
-    rssm = RSSM(8, 4, 16, latents=3, classes=4, hidden=8, recurrence=recurrence, blocks=4, learned_initial=True)
+    rssm = rssm_of(recurrence=recurrence, blocks=4, learned_initial=True)
     embedding, action = torch.randn(2, 6, 8), torch.rand(2, 6, 4) * 2 - 1
     is_init = torch.zeros(2, 6, dtype=torch.bool)
     is_init[1, 3] = True

@@ -8,56 +8,36 @@ import pytest
 import torch
 from tensordict import TensorDict
 from torchrl.collectors import Collector
-from torchrl.data import Binary, Bounded, Composite, Unbounded
-from torchrl.envs import EnvBase, InitTracker, TransformedEnv
+from torchrl.envs import InitTracker, TransformedEnv
 
 from dreamer_racing.experience.streams import records_from_rollout
 from dreamer_racing.modules.agent import Agent, DreamerPolicy
 from dreamer_racing.modules.interface import Interface
-from dreamer_racing.modules.rssm import CONTEXT, RSSM, LatentFormat
+from dreamer_racing.modules.rssm import CONTEXT, LatentFormat
 from dreamer_racing.modules.sizes import SIZES
+from tests.dreamers import rssm_of
+from tests.experience.test_replay import CountingEnv
 
 
-class NoiseEnv(EnvBase):
+class NoiseEnv(CountingEnv):
     """Drones that see noise; drone i crashes every i + 2 steps, so that resets are partial."""
 
-    def __init__(self, num_envs: int = 3) -> None:
-        super().__init__(batch_size=[num_envs])
-        self.generator = torch.Generator().manual_seed(0)
-        self.steps = torch.zeros(num_envs, 1, dtype=torch.int64)
-        self.observation_spec = Composite(
-            pixels=Bounded(0, 255, shape=(num_envs, 64, 64, 3), dtype=torch.uint8), shape=[num_envs]
-        )
-        self.action_spec = Bounded(-1, 1, shape=(num_envs, 4))
-        self.reward_spec = Unbounded(shape=(num_envs, 1))
-        flags = {
-            key: Binary(1, shape=(num_envs, 1), dtype=torch.bool, device="cpu")
-            for key in ("done", "terminated", "truncated")
-        }
-        self.full_done_spec = Composite(**flags, shape=[num_envs])
+    def __init__(self) -> None:
+        super().__init__(3, image_shape=(64, 64, 3))
+        self.steps = torch.zeros(3, 1, dtype=torch.int64)
 
-    def _observe(self) -> torch.Tensor:
-        shape = (*self.batch_size, 64, 64, 3)
-        return torch.randint(0, 256, shape, dtype=torch.uint8, generator=self.generator)
+    def _observation(self) -> dict[str, torch.Tensor]:
+        return {"pixels": torch.randint(0, 256, (3, 64, 64, 3), dtype=torch.uint8, generator=self.generator)}
 
     def _reset(self, tensordict: TensorDict | None = None) -> TensorDict:
-        reset = None if tensordict is None else tensordict.get("_reset", None)
-        if reset is None:
-            reset = torch.ones_like(self.steps, dtype=torch.bool)
-        self.steps[reset] = 0
-        flags = {key: torch.zeros_like(self.steps, dtype=torch.bool) for key in ("done", "terminated", "truncated")}
-        return TensorDict({"pixels": self._observe(), **flags}, self.batch_size)
+        self.steps[... if tensordict is None or "_reset" not in tensordict else tensordict["_reset"]] = 0
+        return super()._reset(tensordict)
 
     def _step(self, tensordict: TensorDict) -> TensorDict:
         assert tensordict["action"].abs().max() <= 1
         self.steps += 1
-        done = self.steps >= torch.arange(2, 2 + len(self.steps)).unsqueeze(-1)
-        flags = {"done": done, "terminated": done.clone(), "truncated": torch.zeros_like(done)}
-        reward = torch.zeros(*self.batch_size, 1)
-        return TensorDict({"pixels": self._observe(), "reward": reward, **flags}, self.batch_size)
-
-    def _set_seed(self, seed: int | None) -> None:
-        self.generator.manual_seed(seed or 0)
+        done = self.steps >= torch.arange(2, 5).unsqueeze(-1)
+        return super()._step(tensordict).update({"done": done, "terminated": done, "truncated": torch.zeros_like(done)})
 
 
 def make_policy(deterministic: bool = False, sampled: bool = True) -> tuple[Agent, DreamerPolicy]:
@@ -156,14 +136,9 @@ def test_policy_takes_any_batch_size(batch):
 # Latents that a replay keeps come back as they were.
 
 
-def make_rssm(sampled: bool) -> RSSM:
-    torch.manual_seed(0)
-    return RSSM(embedding=8, action=4, belief=16, latents=3, classes=4, hidden=8, sampled=sampled)
-
-
 @pytest.mark.parametrize("sampled", [True, False])
 def test_latents_survive_packing(sampled):
-    rssm = make_rssm(sampled)
+    rssm = rssm_of(sampled=sampled)
     posterior = rssm.observe(torch.randn(2, 5, 8), torch.randn(2, 5, 4), torch.zeros(2, 5, dtype=torch.bool))
     packed = rssm.latent_format.pack(posterior.belief, posterior.state)
     belief, state = rssm.latent_format.unpack(packed)
@@ -179,30 +154,10 @@ def test_bytes_of_a_record_by_hand():
 
 
 def test_probabilities_draw_nothing_and_sum_to_one():
-    rssm = make_rssm(sampled=False)
+    rssm = rssm_of(sampled=False)
     belief, state = torch.randn(6, 16), torch.rand(6, 12)
     torch.manual_seed(1)
     first = rssm.imagine_step(belief, state, torch.zeros(6, 4))
     second = rssm.imagine_step(belief, state, torch.zeros(6, 4), deterministic=True)
     torch.testing.assert_close(first[1], second[1], atol=0, rtol=0)
     torch.testing.assert_close(first[1].unflatten(-1, (3, 4)).sum(-1), torch.ones(6, 3))
-
-
-@pytest.mark.parametrize("sampled", [True, False])
-def test_a_window_that_goes_on_from_stored_latents_is_the_one_that_never_stopped(sampled):
-    rssm = make_rssm(sampled)
-    embedding, action = torch.randn(3, 9, 8), torch.randn(3, 9, 4)
-    is_init = torch.zeros(3, 9, dtype=torch.bool)
-    is_init[1, 6] = True
-    whole = rssm.observe(embedding, action, is_init, deterministic=True)
-    packed = rssm.latent_format.pack(whole.belief, whole.state)
-    resumed = rssm.observe(
-        embedding[:, 4:],
-        action[:, 4:],
-        is_init[:, 4:],
-        initial=rssm.latent_format.unpack(packed[:, 3]),
-        deterministic=True,
-    )
-    torch.testing.assert_close(resumed.belief, whole.belief[:, 4:], atol=1e-3, rtol=0)
-    cold = rssm.observe(embedding[:, 4:], action[:, 4:], is_init[:, 4:], deterministic=True)
-    assert (cold.belief - whole.belief[:, 4:]).abs().max() > 0.01  # so that the comparison above says something

@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import pytest
 import torch
 
+from dreamer_racing.modules import RSSM, SIZES
 from dreamer_racing.modules.recurrent_cells import BlockGRUCell
-from dreamer_racing.modules.rssm import RSSM, mix_uniform, sample_one_hot
+from dreamer_racing.modules.rssm import mix_uniform, sample_one_hot
+from tests.dreamers import rssm_of
 
 KINDS = [
     {"recurrence": "dense", "norm": "layer", "learned_initial": False},
@@ -19,7 +22,7 @@ KINDS = [
 
 def make_rssm(**kind) -> RSSM:
     torch.manual_seed(0)
-    rssm = RSSM(embedding=8, action=4, belief=16, latents=3, classes=4, hidden=8, blocks=4, **kind)
+    rssm = rssm_of(blocks=4, **kind)
     if rssm.learned_initial:
         torch.nn.init.normal_(rssm.initial_belief)
     return rssm
@@ -127,7 +130,7 @@ def test_imagining_is_the_same_recurrence_as_observing(kind):
 def test_block_cell_equals_blocks_that_read_the_shared_inputs():
     """The reference concatenates the shared inputs to each block; here the two products are summed."""
     torch.manual_seed(0)
-    cell = BlockGRUCell(belief=8, state=6, action=4, hidden=5, norm="rms", blocks=2)
+    cell = BlockGRUCell(replace(SIZES["size1m"], belief=8, latents=2, classes=3, hidden=5, blocks=2), action=4)
     belief, inputs = torch.randn(3, 8), torch.randn(3, 15)
     ours = cell.hidden_shared(inputs) + cell.hidden_blocks(belief)
     for block in range(2):
@@ -150,4 +153,4 @@ def test_gradient_reaches_the_first_record_but_not_across_a_reset(kind):
 
 def test_unknown_recurrences_are_refused():
     with pytest.raises(ValueError, match=r"recurrence=lstm: must be one of block, dense"):
-        RSSM(8, 4, 16, latents=3, classes=4, hidden=8, recurrence="lstm")
+        rssm_of(recurrence="lstm")

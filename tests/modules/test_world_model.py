@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import pytest
 import torch
 
+from dreamer_racing.modules import SIZES
 from dreamer_racing.modules.autoencoder import (
     ImageDecoder,
     ImageEncoder,
@@ -57,23 +60,20 @@ def test_whole_window_may_be_context():
     assert belief.shape[:2] == state.shape[:2] == (2, 5)
 
 
-VARIANTS = [
-    {"multipliers": (2, 3, 4, 4), "kernel": 5, "strided": False, "norm": "rms"},
-    {"multipliers": (2, 3, 4, 4), "kernel": 5, "strided": True, "norm": "rms"},
-    {"multipliers": (1, 2, 4, 8), "kernel": 4, "strided": True, "norm": "layer"},
-    {"multipliers": (1, 2, 4), "kernel": 4, "strided": True, "norm": "layer", "patch": 2},
-]
+SMALL = replace(SIZES["size1m"], belief=8, latents=2, classes=3, units=4, cnn_depth=2, blocks=1)
+LAYER = replace(SMALL, cnn_multipliers=(1, 2, 4, 8), cnn_kernel=4, strided=True, norm="layer")
+VARIANTS = [SMALL, replace(SMALL, strided=True), LAYER, replace(LAYER, cnn_multipliers=(1, 2, 4), cnn_patch=2)]
 
 
 @pytest.mark.parametrize(("image_size", "side"), [(32, 2), (64, 4), (96, 6)])
 @pytest.mark.parametrize("variant", VARIANTS)
 def test_encoder_and_decoder_shapes(variant, image_size, side):
-    encoder = ImageEncoder(depth=2, **variant, image_size=image_size)
+    encoder = ImageEncoder(variant, image_size)
     embedding = encoder(torch.randint(0, 256, (2, 3, image_size, image_size, 3), dtype=torch.uint8))
-    channels = 2 * variant["multipliers"][-1]
+    channels = 2 * variant.cnn_multipliers[-1]
     assert embedding.shape == (2, 3, encoder.embedding_size) == (2, 3, side * side * channels)
     for blocks in (1, 2):
-        decoder = ImageDecoder(belief=8, state=6, units=4, depth=2, blocks=blocks, **variant, image_size=image_size)
+        decoder = ImageDecoder(replace(variant, blocks=blocks), image_size)
         images = decoder(torch.randn(2, 3, 8), torch.randn(2, 3, 6))
         assert images.shape == (2, 3, image_size, image_size, 3)
         assert images.min() > 0
@@ -85,15 +85,15 @@ def test_images_that_cannot_be_halved_are_refused(image_size):
     assert smallest_map(16, patch=2, stages=3) == 1
     message = f"image_size={image_size}: .* 2 × 2 pixels .* 3 times, .* multiple of 16, for instance 32, 64 or 96"
     with pytest.raises(ValueError, match=message):
-        ImageEncoder(depth=2, **VARIANTS[-1], image_size=image_size)
+        ImageEncoder(VARIANTS[-1], image_size)
     with pytest.raises(ValueError, match=message):
-        ImageDecoder(belief=8, state=6, units=4, depth=2, blocks=1, **VARIANTS[-1], image_size=image_size)
+        ImageDecoder(VARIANTS[-1], image_size)
 
 
 @pytest.mark.parametrize("variant", VARIANTS)
 def test_squared_error_is_that_of_the_images(variant):
     torch.manual_seed(0)
-    decoder = ImageDecoder(belief=8, state=6, units=4, depth=2, blocks=1, **variant)
+    decoder = ImageDecoder(variant)
     belief, state = torch.randn(2, 3, 8), torch.randn(2, 3, 6)
     pixels = torch.randint(0, 256, (2, 3, 64, 64, 3), dtype=torch.uint8)
     expected = (decoder(belief, state) - pixels / 255).square().mean()
@@ -110,7 +110,7 @@ def test_folding_is_undone_by_unfolding():
 
 @pytest.mark.parametrize("variant", VARIANTS)
 def test_first_stage_sees_pixels_scaled_to_half(variant):
-    encoder = ImageEncoder(depth=2, **variant)
+    encoder = ImageEncoder(variant)
     seen = []
     encoder.convolutions[0].register_forward_pre_hook(lambda _, inputs: seen.append(inputs[0]))
     encoder(torch.tensor([0, 255], dtype=torch.uint8).view(2, 1, 1, 1).expand(2, 64, 64, 3))
@@ -122,7 +122,7 @@ def test_first_stage_sees_pixels_scaled_to_half(variant):
 def test_embedding_depends_on_every_region_of_the_image():
     torch.manual_seed(0)
     for variant in VARIANTS:
-        encoder = ImageEncoder(depth=2, **variant)
+        encoder = ImageEncoder(variant)
         black = torch.zeros(1, 64, 64, 3, dtype=torch.uint8)
         for row, column in ((0, 0), (0, 60), (60, 0), (30, 30)):
             spotted = black.clone()
