@@ -14,7 +14,7 @@ Columns: `s` is the median of one whole update (losses, gradients, optimiser, sl
 process on a CPU (resident) or of the device, GiB.
 
 With `--launches` nothing is timed: the kernels that an update would launch on a CUDA device under bfloat16 are counted
-on a CPU (`learners/launches.py`), with and without `few_kernels`, for windows that begin with stored latents. Their
+on a CPU (`tests/launches.py`), with and without `few_kernels`, for windows that begin with stored latents. Their
 number depends on T, H and the size's layers, not on B and widths, so that narrow networks are used; an RMS norm, which
 is several operations on a CPU, counts once as on CUDA. `casts` is the number of type conversions among them.
 """
@@ -22,9 +22,11 @@ is several operations on a CPU, counts once as on CUDA. `casts` is the number of
 import argparse
 import resource
 import statistics
+import sys
 from collections.abc import Callable
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass, replace
+from itertools import product
 from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
@@ -41,7 +43,6 @@ from dreamer_racing.experience.replay import make_replay
 from dreamer_racing.learners.config import LearnerConfig
 from dreamer_racing.learners.dreamer_v3 import DreamerV3
 from dreamer_racing.learners.latent_ppo import CRITICS, LatentPPO
-from dreamer_racing.learners.launches import launches
 from dreamer_racing.learners.update import WorldModelLearner
 from dreamer_racing.losses import DreamerV3Losses, LatentPPOLosses
 from dreamer_racing.machine import keep_freed_memory
@@ -121,10 +122,7 @@ def print_launches(parser: argparse.ArgumentParser, arguments: argparse.Namespac
         parser.error(f"--launches counts kernels on a CPU: do not add --{given[0].replace('_', '-')}.")
     counted = [
         count_launches(size, loss, actor, arguments.batch, arguments.horizon, few)
-        for size in arguments.sizes
-        for loss in arguments.losses
-        for actor in arguments.actor_losses
-        for few in (False, True)
+        for size, loss, actor, few in product(arguments.sizes, arguments.losses, arguments.actor_losses, (False, True))
     ]
     report(counted, LAUNCHES, arguments.json)
 
@@ -280,13 +278,14 @@ def count_calls(update: Callable[[], Any]) -> int:
     return sum(event.count for event in profiler.key_averages() if event.key.startswith("aten::"))
 
 
-def count_launches(
-    size: str, loss: str, actor: str, batch: tuple[int, int], horizon: int, few_kernels: bool, mixed: bool = True
-) -> dict[str, Any]:
+def count_launches(size: str, loss: str, actor: str, batch: tuple[int, int], horizon: int, few: bool) -> dict[str, Any]:
     """Count the kernels of an update on a CUDA device; return one record."""
+    sys.path.insert(0, str(Path(__file__).parents[1]))
+    from tests.launches import launches
+
     full = get_size(size)
     narrow = replace(full, **NARROW, cnn_depth=full.blocks, name=size)  # divisible by the blocks
-    config = LearnerConfig(mixed_precision=mixed, few_kernels=few_kernels, imagination_horizon=horizon)
+    config = LearnerConfig(mixed_precision=True, few_kernels=few, imagination_horizon=horizon)
     learner = make_learner(narrow, loss, actor, config)
     data = filled_replay((2, batch[1]), "cpu").sample()
     before = (torch.zeros(*data.batch_size, width) for width in (narrow.belief, narrow.state))
@@ -297,7 +296,7 @@ def count_launches(
         seen = launches(lambda: learner.update(data))
     return {
         "benchmark": "learner_launches", "size": size, "loss": loss, "actor": actor,
-        "batch": "x".join(map(str, batch)), "horizon": horizon, "few_kernels": few_kernels,
+        "batch": "x".join(map(str, batch)), "horizon": horizon, "few_kernels": few,
         "launches": seen.count, "casts": seen.kernels["_to_copy"], "waits": len(seen.waits),
     }  # fmt: skip
 

@@ -16,8 +16,8 @@ from torchrl.envs import EnvBase, InitTracker, TransformedEnv
 from dreamer_racing.experience.replay import make_replay
 from dreamer_racing.experience.replay_place import replay_bytes
 from dreamer_racing.experience.streams import records_from_rollout
-from dreamer_racing.learners.launches import launches
 from dreamer_racing.modules.rssm import LatentFormat
+from tests.launches import launches
 
 REWARDS = ("reward", "reward_base", "body_rate_norm")
 KEYS = ("pixels", "previous_action", *REWARDS, "is_init", "terminated", "truncated")

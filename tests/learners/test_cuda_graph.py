@@ -22,25 +22,15 @@ from dreamer_racing.evaluation.course import Course
 from dreamer_racing.evaluation.held_out import SEEN, held_out_metrics
 from dreamer_racing.learners import latent_ppo
 from dreamer_racing.learners.dreamer_v3 import DreamerV3
-from dreamer_racing.learners.launches import Launches, launches
 from dreamer_racing.learners.update import WorldModelLearner
 from dreamer_racing.losses import TARGETS, Trajectory
 from dreamer_racing.modules import Interface, get_size
-from tests.dreamers import latent_ppo_of, learner_of
+from tests.dreamers import latent_ppo_of, learner_of, make_windows
+from tests.launches import Launches, launches
 
 
 def batch(device: str, windows: int = 2, steps: int = 4) -> TensorDict:
-    generator = torch.Generator().manual_seed(0)
-    shape = (windows, steps)
-    records = {
-        "pixels": torch.randint(0, 256, (*shape, 64, 64, 3), dtype=torch.uint8, generator=generator),
-        "previous_action": torch.rand(*shape, 4, generator=generator) * 2 - 1,
-        "reward": torch.randn(*shape, 1, generator=generator),
-        "is_init": torch.rand(*shape, 1, generator=generator) < 0.2,
-        "terminated": torch.zeros(*shape, 1, dtype=torch.bool),
-        "truncated": torch.zeros(*shape, 1, dtype=torch.bool),
-    }
-    return TensorDict(records, shape).to(device)
+    return make_windows(windows, steps, is_init=[(0, 2)]).to(device)
 
 
 def make(device: str, **settings: object) -> DreamerV3:
@@ -137,21 +127,8 @@ SIZES = {
 }
 
 
-def records(device: str = "cpu", windows: int = 3, steps: int = 4) -> TensorDict:
-    """A batch as the replay delivers it, with the latents before each record."""
-    shape = (windows, steps)
-    with torch.device(device):
-        flags = {name: torch.zeros(*shape, 1, dtype=torch.bool) for name in ("is_init", "terminated", "truncated")}
-        numbers = {"previous_action": 4, "reward": 1, ("privileged", "vector"): PRIVILEGED}
-        return TensorDict(
-            {
-                "pixels": torch.zeros(*shape, 64, 64, 3, dtype=torch.uint8),
-                **flags,
-                **{name: torch.rand(*shape, width) for name, width in numbers.items()},
-            },
-            shape,
-            device=device,
-        )
+def records(device: str = "cpu") -> TensorDict:
+    return make_windows(3, 4, privileged=PRIVILEGED).to(device)
 
 
 def with_context(batch: TensorDict, learner: WorldModelLearner) -> TensorDict:

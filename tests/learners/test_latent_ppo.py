@@ -15,11 +15,11 @@ from torch import Tensor, nn
 from dreamer_racing.learners import latent_ppo
 from dreamer_racing.learners.gradient_step import FiniteGuard, NonFiniteLossError
 from dreamer_racing.learners.latent_ppo import LatentPPO, PPOUpdate
-from dreamer_racing.learners.launches import launches
 from dreamer_racing.losses import PPOUpdateConfig, rollout_return
 from dreamer_racing.modules import Interface, join_features
 from dreamer_racing.modules.heads import ActionDistribution, symlog
 from tests.dreamers import latent_ppo_of
+from tests.launches import launches
 from tests.learners.test_dreamer_v3 import make_batch
 
 N, T, P = 3, 4, 5

@@ -9,13 +9,13 @@ import torch
 from torch import Tensor, nn
 
 from dreamer_racing.learners.dreamer_v3 import DreamerV3
-from dreamer_racing.learners.launches import launches
 from dreamer_racing.losses.imagination import Imagination, imagine
 from dreamer_racing.modules import ModelSize, few_kernels, get_size
 from dreamer_racing.modules.few_kernels import cast_once
 from dreamer_racing.modules.layers import BlockLinear, LayerNorm, RMSNorm, autocast, linear, unrolled
 from dreamer_racing.modules.recurrent_cells import GatedUpdate, gate_shift, gated_update
 from tests.dreamers import imagine_from, latent_ppo_of, learner_of
+from tests.launches import launches
 from tests.learners.test_dreamer_v3 import make_batch
 
 SMALL = {"belief": 32, "hidden": 16, "latents": 4, "classes": 4, "units": 16}
@@ -172,7 +172,7 @@ def test_norms_keep_the_type_that_comes_in_where_autocast_would_not(norm: type[n
 @pytest.mark.parametrize("actor", ["reinforce", "dynamics"])
 def test_the_actors_loss_moves_nothing_but_the_actor(actor: str) -> None:
     learner = learner_of("debug", seed=0, horizon=3, actor=actor, few_kernels=True, mixed_precision=True)
-    with learner.autocast(), learner._weights():
+    with learner.autocast(), cast_once(learner.modules, torch.bfloat16):
         imagine_from(learner, torch.zeros(4, 32), torch.zeros(4, 16))[0]["loss_actor"].backward()
     touched = {name for name, part in learner.agent.named_children() for p in part.parameters() if p.grad is not None}
     assert touched == {"actor"}

@@ -16,17 +16,14 @@ from torch import Tensor
 from torch.utils._python_dispatch import TorchDispatchMode
 from torch.utils._pytree import tree_leaves
 
-VIEWS = frozenset((
+FREE = frozenset((
     "_reshape_alias", "_unsafe_view", "alias", "as_strided", "chunk", "detach", "diagonal", "expand",
     "lift_fresh", "permute", "real", "reshape", "select", "slice", "split", "split_with_sizes", "squeeze", "t",
     "transpose", "unbind", "unfold", "unsafe_split", "unsqueeze", "view", "view_as",
-))  # fmt: skip
-"""Operations that only make views of memory."""
-ALLOCATIONS = frozenset((
     "_record_function_enter_new", "_record_function_exit", "empty", "empty_like", "empty_permuted",
     "empty_strided", "new_empty", "new_empty_strided", "record_stream", "resize_", "set_",
 ))  # fmt: skip
-"""Operations that only allocate memory, record its use, or mark a profiler's range."""
+"""Operations that only make views of memory, allocate it, record its use, or mark a profiler's range."""
 WAITS = frozenset((
     "_local_scalar_dense", "_unique2", "bincount", "equal", "is_nonzero", "item", "masked_select", "nonzero",
     "unique_consecutive", "unique_dim",
@@ -36,6 +33,7 @@ INDEXED = frozenset((
     "_index_put_impl_", "_unsafe_index", "_unsafe_index_put", "index", "index_put", "index_put_",
 ))  # fmt: skip
 COPIES = frozenset(("_to_copy", "copy_"))
+MACHINERY = ("/torch/", "/tensordict/", "/contextlib", __file__)
 
 
 class Launches(TorchDispatchMode):
@@ -48,13 +46,6 @@ class Launches(TorchDispatchMode):
         kernels: Number of operations by name.
         waits: Places where the CPU would wait for the device, as ``operation at file:line``.
         mixed: Places where an operation has tensors on several devices, or copies between devices; likewise.
-
-    Example:
-        >>> with Launches() as seen:
-        ...     total = (torch.ones(2, 3).T + 1).sum()
-        ...     value = total.item()
-        >>> seen.count, dict(seen.kernels), len(seen.waits)
-        (3, {'ones': 1, 'add': 1, 'sum': 1}, 1)
     """
 
     def __init__(self) -> None:
@@ -75,38 +66,26 @@ class Launches(TorchDispatchMode):
         kwargs = kwargs or {}
         name = func._schema.name.partition("::")[2]
         tensors = [value for value in tree_leaves((args, kwargs)) if isinstance(value, Tensor)]
-        if name in WAITS or _indexes_by_mask(name, args):
+        indices = tree_leaves(args[1]) if name in INDEXED else []
+        masks = [value for value in indices if isinstance(value, Tensor) and value.dtype in (torch.bool, torch.uint8)]
+        if name in WAITS or masks:  # how many elements a mask selects is waited for
             self.waits.append(_place(name))
-        elif name not in VIEWS | ALLOCATIONS:
+        elif name not in FREE:
             self.kernels[name] += 1
         result = func(*args, **kwargs)
-        if len(_devices(tensors, result if name in COPIES else ())) > 1:
+        if name in COPIES:
+            tensors += [value for value in tree_leaves(result) if isinstance(value, Tensor)]
+        # Scalars on the CPU fit any device.
+        if len({value.device.type for value in tensors if value.ndim or value.device.type != "cpu"}) > 1:
             self.mixed.append(_place(name))
         return result
 
 
-def _indexes_by_mask(name: str, args: tuple) -> bool:
-    """Return whether an operation indexes by a mask, so that the CPU has to wait for the number of elements."""
-    return name in INDEXED and any(
-        isinstance(index, Tensor) and index.dtype in (torch.bool, torch.uint8) for index in tree_leaves(args[1])
-    )
-
-
-def _devices(tensors: Sequence[Tensor], result: Any) -> set[str]:
-    """Return the device types of tensors; scalars on the CPU, which fit any device, are ignored."""
-    results = [value for value in tree_leaves(result) if isinstance(value, Tensor)]
-    return {value.device.type for value in (*tensors, *results) if value.ndim or value.device.type != "cpu"}
-
-
 def _place(name: str) -> str:
     """Return an operation and the innermost line outside of torch and tensordict that called it."""
-    stack = [frame for frame in traceback.extract_stack()[:-2] if not _is_machinery(frame.filename)]
-    frame = stack[-1]
+    stack = traceback.extract_stack()
+    frame = [frame for frame in stack if not any(part in frame.filename for part in MACHINERY)][-1]
     return f"{name} at {'/'.join(frame.filename.split('/')[-2:])}:{frame.lineno}"
-
-
-def _is_machinery(filename: str) -> bool:
-    return any(part in filename for part in ("/torch/", "/tensordict/", "/contextlib", __file__))
 
 
 def launches(function: Callable[[], Any]) -> Launches:
