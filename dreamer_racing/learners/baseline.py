@@ -6,10 +6,11 @@ from abc import ABC, abstractmethod
 from typing import Any
 
 import torch
+from tensordict import TensorDictBase
 from tensordict.nn import ProbabilisticTensorDictSequential
 from torch import Tensor, nn
 
-from dreamer_racing.learners.gradient_step import FiniteGuard
+from dreamer_racing.learners.gradient_step import FiniteGuard, gradient_norms
 from dreamer_racing.learners.learner import ValueFunction
 from dreamer_racing.learners.networks import BaselinePolicy, NetworkSize, check_layers, layers_of
 from dreamer_racing.modules import Interface
@@ -18,16 +19,11 @@ from dreamer_racing.modules import Interface
 class BaselineLearner(ABC):
     """Base of learners with an actor, one optimiser and a saved state.
 
-    Args:
-        size: Size of the networks.
-        interface: Observations and actions of the agent.
-        device: Where the networks live and updates run.
-
     Attributes:
         actor: Network of the policy.
         networks: Trained parameters by the name of their network.
         optimizer: Optimiser of all networks.
-        device: As given.
+        device: Where the networks live and updates run.
         updates: Number of gradient steps so far.
     """
 
@@ -47,7 +43,7 @@ class BaselineLearner(ABC):
         return BaselinePolicy(self.actor, deterministic)
 
     def evaluation_policy(self) -> BaselinePolicy:
-        """Return the policy to evaluate: the one that is trained."""
+        """Return the policy that is trained, because no weights are averaged."""
         return self.policy()
 
     def value_function(self) -> ValueFunction | None:
@@ -77,11 +73,22 @@ class BaselineLearner(ABC):
         self.optimizer.param_groups[0]["lr"] = rate  # a setting of this learner, not state
         self.updates = state_dict["updates"]
 
+    def _gradient_step(
+        self, loss: Tensor, metrics: dict[str, Tensor], batch: TensorDictBase, clip: float | None = None
+    ) -> dict[str, Tensor]:
+        """Make a gradient step unless something is not finite, each network's norm clipped; return all metrics."""
+        self.optimizer.zero_grad(set_to_none=True)
+        loss.backward()
+        norms = gradient_norms(self.networks)
+        if clip is not None:
+            for name, parameters in self.networks.items():
+                nn.utils.clip_grads_with_norm_(parameters, clip, norms[f"gradient_norm/{name}"])
+        metrics = {name: value.detach() for name, value in {**metrics, **norms, "loss": loss}.items()}
+        self._guard.check(metrics, batch)
+        self.optimizer.step()
+        self.updates += 1
+        return metrics
+
     @abstractmethod
     def _modules(self) -> dict[str, nn.Module]:
         """Return the modules to save, by name."""
-
-
-def detached(outputs: dict[str, Tensor]) -> dict[str, Tensor]:
-    """Return metrics without their gradients."""
-    return {name: value.detach() for name, value in outputs.items()}

@@ -14,6 +14,7 @@ from tensordict.nn import ProbabilisticTensorDictSequential, TensorDictModuleBas
 from torch import Tensor, nn
 from torchrl.envs.transforms import Compose, Transform
 from torchrl.envs.utils import ExplorationType, set_exploration_type
+from torchrl.modules import ProbabilisticActor
 
 from dreamer_racing.modules import Interface
 from dreamer_racing.modules.heads import symlog
@@ -34,15 +35,9 @@ class NetworkSize:
 
 
 class ImageTrunk(nn.Module):
-    """Three convolutions and a linear layer.
+    """Three convolutions and a linear layer for images of at least 36 × 36 pixels.
 
     The paper only says "a CNN"; this is the CNN of Stable-Baselines3, on which its code builds.
-
-    Args:
-        image_size: Height and width of the images, pixels; at least 36.
-
-    Raises:
-        ValueError: If the images are too small.
 
     Example:
         >>> ImageTrunk()(torch.zeros(2, 64, 64, 3, dtype=torch.uint8)).shape
@@ -76,17 +71,9 @@ class ImageTrunk(nn.Module):
 
 
 class ObservationNetwork(nn.Module):
-    """Network from observations, and optionally an action, to a vector of outputs.
+    """Network from the observations under ``in_keys``, and optionally an action, to O outputs.
 
-    Args:
-        interface: Observations and actions of the agent.
-        outputs: O.
-        size: Size of the MLP.
-        with_action: Whether the action is also an input.
-        output_scale: Factor on the initial weights of the last layer.
-
-    Attributes:
-        in_keys: Keys of the inputs of ``forward``, in their order.
+    The initial weights of the last layer are multiplied by ``output_scale``.
 
     Example:
         >>> network = ObservationNetwork(Interface(pixels=False, vector_dim=21), 1, NetworkSize(2, 32))
@@ -95,12 +82,7 @@ class ObservationNetwork(nn.Module):
     """
 
     def __init__(
-        self,
-        interface: Interface,
-        outputs: int,
-        size: NetworkSize,
-        with_action: bool = False,
-        output_scale: float = 1.0,
+        self, interface: Interface, outputs: int, size: NetworkSize, with_action: bool = False, output_scale: float = 1
     ) -> None:
         super().__init__()
         self.in_keys = [*interface.observation_keys, *(["action"] if with_action else [])]
@@ -118,24 +100,16 @@ class ObservationNetwork(nn.Module):
 
     def forward(self, *inputs: Tensor) -> Tensor:
         """Map the tensors under ``in_keys`` to ``(..., O)``."""
-        parts = [self._scaled(key, value) for key, value in zip(self.in_keys, inputs, strict=True)]
+        preprocess = {PIXELS: self.trunk, IMU: symlog}
+        parts = []
+        for key, value in zip(self.in_keys, inputs, strict=True):
+            function = preprocess.get(key)
+            parts.append(value if function is None else function(value))
         return self.mlp(parts[0] if len(parts) == 1 else torch.cat(parts, -1))
-
-    def _scaled(self, key: str, value: Tensor) -> Tensor:
-        """Return an input as the MLP takes it."""
-        if key == PIXELS:
-            assert self.trunk is not None, "made so"
-            return self.trunk(value)
-        return symlog(value) if key == IMU else value
 
 
 class GaussianNetwork(nn.Module):
-    """An ``ObservationNetwork`` whose outputs become the parameters of a normal distribution.
-
-    Args:
-        network: Network whose outputs go to ``parameters``.
-        parameters: Module that returns ``loc`` and ``scale``.
-    """
+    """An ``ObservationNetwork`` whose outputs ``parameters`` turns into ``loc`` and ``scale`` of a distribution."""
 
     def __init__(self, network: ObservationNetwork, parameters: nn.Module) -> None:
         super().__init__()
@@ -153,10 +127,6 @@ class NetworkModule(TensorDictModuleBase):
 
     ``TensorDictModule`` looks for pandas on the disk at every write (tensordict 0.14.3), which takes a tenth of the
     time of SAC from vectors.
-
-    Args:
-        network: Network with ``in_keys`` that returns a tensor for each of ``out_keys``.
-        out_keys: Keys of its outputs.
     """
 
     def __init__(self, network: ObservationNetwork | GaussianNetwork, out_keys: list[str]) -> None:
@@ -172,11 +142,21 @@ class NetworkModule(TensorDictModuleBase):
         return tensordict
 
 
+def make_actor(network: ObservationNetwork, parameters: nn.Module, distribution: type) -> ProbabilisticActor:
+    """Make an actor that samples from a distribution with the ``loc`` and ``scale`` that ``parameters`` returns."""
+    return ProbabilisticActor(
+        NetworkModule(GaussianNetwork(network, parameters), ["loc", "scale"]),
+        in_keys=["loc", "scale"],
+        distribution_class=distribution,
+        return_log_prob=True,
+    )
+
+
 class BaselinePolicy(TensorDictModuleBase):
-    """Policy of an actor without memory.
+    """Policy of an actor without memory, which is shared, not copied.
 
     Args:
-        actor: Actor, which is shared, not copied.
+        actor: The actor.
         deterministic: Act by the distribution's ``deterministic_sample``; may be set at any time.
     """
 
@@ -206,11 +186,7 @@ def layers_of(size: NetworkSize, interface: Interface) -> dict[str, Any]:
 
 
 def check_layers(saved: dict[str, Any], present: dict[str, Any]) -> None:
-    """Check that saved networks have the size and inputs of this learner's.
-
-    Args:
-        saved: ``layers_of`` the networks of the checkpoint.
-        present: ``layers_of`` the networks of the learner that loads it.
+    """Check that ``layers_of`` saved networks are those of this learner's.
 
     Raises:
         ValueError: If they differ.
@@ -221,13 +197,12 @@ def check_layers(saved: dict[str, Any], present: dict[str, Any]) -> None:
             f"The checkpoint's networks were made with env.from_pixels={there}, this learner's with {here}: set "
             f"env.from_pixels={there}, or start a new run."
         )
-    if (there := saved.get("imu", False)) is not present["imu"]:  # older checkpoints lack it
+    if (there := saved["imu"]) is not present["imu"]:
         raise ValueError(
             f"The checkpoint's networks were made {'with' if there else 'without'} env.imu, and this learner's are "
             f"made {'without' if there else 'with'} it: set it as it was, or start a new run."
         )
-    names = {"layers": "network.layers", "units": "network.units", "image_size": "env.image_size"}
-    for key, setting in names.items():
+    for key, setting in (("layers", "network.layers"), ("units", "network.units"), ("image_size", "env.image_size")):
         if saved[key] != present[key]:
             raise ValueError(
                 f"The checkpoint's networks were made with {setting}={saved[key]}, this learner's with {present[key]}: "

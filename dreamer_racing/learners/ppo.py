@@ -12,18 +12,13 @@ import torch
 from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import AddStateIndependentNormalScale
 from torch import Tensor, nn
-from torchrl.modules import IndependentNormal, ProbabilisticActor
+from torchrl.modules import IndependentNormal
 from torchrl.objectives import ClipPPOLoss
 from torchrl.objectives.value.functional import vec_generalized_advantage_estimate
 
-from dreamer_racing.learners.baseline import BaselineLearner, detached
+from dreamer_racing.learners.baseline import BaselineLearner
 from dreamer_racing.learners.learner import Timer, ValueFunction, seeded, untimed
-from dreamer_racing.learners.networks import (
-    GaussianNetwork,
-    NetworkModule,
-    NetworkSize,
-    ObservationNetwork,
-)
+from dreamer_racing.learners.networks import NetworkModule, NetworkSize, ObservationNetwork, make_actor
 from dreamer_racing.modules import Interface
 from dreamer_racing.modules.clipped_normal import clipped_mean
 from dreamer_racing.settings import COUNT, NOT_NEGATIVE, POSITIVE, SHARE, setting
@@ -101,8 +96,12 @@ class PPOLearner(BaselineLearner):
     ) -> None:
         super().__init__(size, interface, device)
         self.config = config or PPOConfig()
-        with seeded(seed):
-            self.actor = _make_actor(interface, size, self.config.initial_std).to(self.device)
+        with seeded(seed):  # the actor's mean depends on the observation, its standard deviation does not
+            network = ObservationNetwork(interface, interface.action_dim, size, output_scale=0.01)
+            deviation = AddStateIndependentNormalScale(
+                interface.action_dim, init_value=math.log(self.config.initial_std)
+            )
+            self.actor = make_actor(network, deviation, ClippedNormal).to(self.device)
             self.critic = NetworkModule(ObservationNetwork(interface, 1, size), ["state_value"]).to(self.device)
         self._loss = ClipPPOLoss(
             self.actor,
@@ -115,12 +114,8 @@ class PPOLearner(BaselineLearner):
             normalize_advantage=True,
         )
         self.networks = {"actor": list(self.actor.parameters()), "critic": list(self.critic.parameters())}
-        self.optimizer = torch.optim.Adam(
-            [p for group in self.networks.values() for p in group],
-            lr=self.config.learning_rate,
-            eps=1e-5,
-            fused=True,
-        )
+        trained = [parameter for parameters in self.networks.values() for parameter in parameters]
+        self.optimizer = torch.optim.Adam(trained, lr=self.config.learning_rate, eps=1e-5, fused=True)
 
     def update(self, rollout: TensorDictBase, timed: Timer = untimed) -> dict[str, Tensor]:
         """Make ``epochs`` passes of gradient steps over a rollout.
@@ -134,12 +129,7 @@ class PPOLearner(BaselineLearner):
 
         Raises:
             NonFiniteLossError: If a loss or gradient is not finite.
-            ValueError: If there are fewer records than minibatches.
         """
-        if rollout.numel() < self.config.minibatches:
-            raise ValueError(
-                f"minibatches={self.config.minibatches}: must be at most {rollout.numel()}, the rollout's records."
-            )
         with timed("advantages"):
             records = self.with_advantages(rollout)
         steps: list[dict[str, Tensor]] = []
@@ -200,17 +190,7 @@ class PPOLearner(BaselineLearner):
         """Make one gradient step on a minibatch ``[M]``."""
         outputs = self._loss(batch)
         total = torch.stack([value for name, value in outputs.items() if name.startswith("loss_")]).sum()
-        self.optimizer.zero_grad(set_to_none=True)
-        total.backward()
-        norms = {
-            f"gradient_norm/{name}": nn.utils.clip_grad_norm_(parameters, self.config.gradient_clip)
-            for name, parameters in self.networks.items()
-        }
-        metrics = detached({**outputs, **norms, "loss": total})
-        self._guard.check(metrics, batch)
-        self.optimizer.step()
-        self.updates += 1
-        return metrics
+        return self._gradient_step(total, outputs, batch, self.config.gradient_clip)
 
     def _modules(self) -> dict[str, nn.Module]:
         return {"actor": self.actor, "critic": self.critic}
@@ -223,15 +203,3 @@ class ClippedNormal(IndependentNormal):
     def deterministic_sample(self) -> Tensor:
         """Mean of the clipped actions, ``(..., A)``."""
         return clipped_mean(self.base_dist.loc, self.base_dist.scale)
-
-
-def _make_actor(interface: Interface, size: NetworkSize, initial_std: float) -> ProbabilisticActor:
-    """Make an actor whose mean depends on the observation, and whose standard deviation does not."""
-    network = ObservationNetwork(interface, interface.action_dim, size, output_scale=0.01)
-    deviation = AddStateIndependentNormalScale(interface.action_dim, init_value=math.log(initial_std))
-    return ProbabilisticActor(
-        NetworkModule(GaussianNetwork(network, deviation), ["loc", "scale"]),
-        in_keys=["loc", "scale"],
-        distribution_class=ClippedNormal,
-        return_log_prob=True,
-    )

@@ -11,17 +11,12 @@ import torch
 from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import NormalParamExtractor
 from torch import Tensor, nn
-from torchrl.modules import ProbabilisticActor, TanhNormal
+from torchrl.modules import TanhNormal
 from torchrl.objectives import SACLoss, SoftUpdate
 
-from dreamer_racing.learners.baseline import BaselineLearner, detached
+from dreamer_racing.learners.baseline import BaselineLearner
 from dreamer_racing.learners.learner import Timer, seeded, untimed
-from dreamer_racing.learners.networks import (
-    GaussianNetwork,
-    NetworkModule,
-    NetworkSize,
-    ObservationNetwork,
-)
+from dreamer_racing.learners.networks import NetworkModule, NetworkSize, ObservationNetwork, make_actor
 from dreamer_racing.modules import Interface
 from dreamer_racing.settings import COUNT, POSITIVE, SHARE, setting
 
@@ -80,8 +75,9 @@ class SACLearner(BaselineLearner):
     ) -> None:
         super().__init__(size, interface, device)
         self.config = config or SACConfig()
-        with seeded(seed):
-            self.actor = _make_actor(interface, size).to(self.device)
+        with seeded(seed):  # mean and standard deviation depend on the observation; tanh squashes into [−1, 1]
+            network = ObservationNetwork(interface, 2 * interface.action_dim, size, output_scale=0.01)
+            self.actor = make_actor(network, NormalParamExtractor(), TanhNormal).to(self.device)
             critic = ObservationNetwork(interface, 1, size, with_action=True)
             self._loss = SACLoss(
                 self.actor,
@@ -117,17 +113,8 @@ class SACLearner(BaselineLearner):
             batch = self.transitions(windows.to(self.device, non_blocking=True))
             outputs = self._loss(batch)
             total = outputs["loss_actor"] + outputs["loss_qvalue"] + outputs["loss_alpha"]
-            self.optimizer.zero_grad(set_to_none=True)
-            total.backward()
-            norms = {
-                f"gradient_norm/{name}": nn.utils.get_total_norm([p.grad for p in parameters if p.grad is not None])
-                for name, parameters in self.networks.items()
-            }
-            metrics = detached({**outputs, **norms, "loss": total})
-            self._guard.check(metrics, batch)
-            self.optimizer.step()
+            metrics = self._gradient_step(total, outputs, batch)
             self._targets.step()
-        self.updates += 1
         return metrics
 
     def transitions(self, windows: TensorDictBase) -> TensorDict:
@@ -137,14 +124,12 @@ class SACLearner(BaselineLearner):
         that the weighted mean of a batch without any transition is still defined.
         """
         before, after = windows[:, 0], windows[:, 1]
-        following = {key: after.get(key) for key in self._keys}
-        following |= {key: after.get(key) for key in ("terminated", "truncated")}
+        following = {key: after.get(key) for key in (*self._keys, "terminated", "truncated")}
         following["done"] = following["terminated"] | following["truncated"]
         following["reward"] = after.get("reward") * self.config.reward_scale
-        observation = {key: before.get(key) for key in self._keys}
         return TensorDict(
             {
-                **observation,
+                **{key: before.get(key) for key in self._keys},
                 "action": after.get("previous_action"),
                 "next": following,
                 "priority_weight": (~after.get("is_init").squeeze(-1)).float().clamp(min=NO_WEIGHT),
@@ -154,14 +139,3 @@ class SACLearner(BaselineLearner):
 
     def _modules(self) -> dict[str, nn.Module]:
         return {"loss": self._loss}
-
-
-def _make_actor(interface: Interface, size: NetworkSize) -> ProbabilisticActor:
-    """Make an actor whose mean and standard deviation depend on the observation, squashed into [−1, 1] by tanh."""
-    network = ObservationNetwork(interface, 2 * interface.action_dim, size, output_scale=0.01)
-    return ProbabilisticActor(
-        NetworkModule(GaussianNetwork(network, NormalParamExtractor()), ["loc", "scale"]),
-        in_keys=["loc", "scale"],
-        distribution_class=TanhNormal,
-        return_log_prob=True,
-    )
