@@ -98,20 +98,17 @@ class DreamerV3(WorldModelLearner):
 
         with timed("imagine"):
             # Imagination: starting from latents of the records, the policy acts H times in the world model.
-            starts = choose_starts(
-                latents.belief,
-                latents.state,
-                batch["terminated"],
-                batch["previous_action"],
-                self.config.imagination_starts,
-            )
+            number = self.config.imagination_starts
+            starts = choose_starts(*latents, batch["terminated"], batch["previous_action"], number)
             with gradient_of_actions(self.objective, model, critic):
                 imagined, action = imagine(model.rssm, actor, starts.belief, starts.state, self.horizon)
 
                 # Rewards, probabilities that the episode continues, and λ-returns of the rollout, (H, N, 1) (Eq. 7).
                 value = critic.value(imagined)  # (H + 1, N, 1)
                 reward = model.reward_head.mean(imagined[1:])
-                goes_on = self._continuation(imagined[1:])
+                goes_on = torch.ones_like(reward)
+                if numbers.continuation:
+                    goes_on = model.continue_head.probability(imagined[1:])
                 discount = self.discount * goes_on
                 returns = lambda_return(reward, value[1:], discount, numbers.lambda_)
 
@@ -144,7 +141,7 @@ class DreamerV3(WorldModelLearner):
             # Critic: two-hot regression on the λ-returns of replayed and of imagined steps (Eq. 10). If every record
             # was a start, replayed returns bootstrap from its imagined return, which is better than the critic's value.
             shape = batch["terminated"].shape
-            bootstrap = returns[0].detach().reshape(shape) if self.config.imagination_starts is None else None
+            bootstrap = returns[0].detach().reshape(shape) if number is None else None
             losses |= self.replay_critic_losses(latents, batch, bootstrap)
             regression, logits = critic_loss(critic, features, returns.detach(), numbers.slow_critic_scale)
             losses["loss_critic"] = (weight * regression).mean()
@@ -177,12 +174,6 @@ class DreamerV3(WorldModelLearner):
             self.horizon = round(imagination_horizon)
             if self._graph is not None:
                 self._graph = self._make_graph()
-
-    def _continuation(self, features: Tensor) -> Tensor:
-        """Return the probability ``(..., 1)`` that the episode continues after features ``(..., F)``."""
-        if not self.loss_config.continuation:
-            return features.new_ones((*features.shape[:-1], 1), dtype=torch.float32)
-        return self.agent.world_model.continue_head.probability(features)
 
     @property
     def modules(self) -> nn.ModuleDict:

@@ -1,4 +1,4 @@
-"""Parts of a gradient step besides losses: optimiser, gradient norms, a guard against non-finite values, CUDA graphs.
+"""Parts of a gradient step besides losses: gradient norms, a guard against non-finite values, CUDA graphs.
 
 An update of a small model is some thousands of kernels, which a GPU runs faster than a CPU can launch them; a CUDA
 graph launches them all at once.
@@ -16,24 +16,8 @@ from tensordict import TensorDictBase
 from torch import Tensor, nn
 
 
-def make_optimizer(groups: list[dict[str, Any]], warmup_updates: int) -> torch.optim.Optimizer:
-    """Make the optimiser of the 2025 reference, LaProp with adaptive gradient clipping.
-
-    Args:
-        groups: Parameter groups with their learning rates: ``[{"params": [...], "lr": ...}, ...]``.
-        warmup_updates: Updates over which the rates rise from zero.
-    """
-    from torchrl.trainers.algorithms import DreamerV3Optimizer
-
-    return DreamerV3Optimizer(groups, lr=groups[0]["lr"], warmup_steps=warmup_updates)
-
-
 def gradient_norms(networks: Mapping[str, list[nn.Parameter]]) -> dict[str, Tensor]:
-    """Return the gradient's global norm of each network that has one, scalars by ``gradient_norm/<network>``.
-
-    Args:
-        networks: Parameters of each network, by its name.
-    """
+    """Return the gradient's global norm of each network that has one, scalars by ``gradient_norm/<network>``."""
     gradients = {name: [p.grad for p in parameters if p.grad is not None] for name, parameters in networks.items()}
     return {f"gradient_norm/{name}": nn.utils.get_total_norm(found) for name, found in gradients.items() if found}
 
@@ -70,11 +54,7 @@ class NonFiniteLossError(RuntimeError):
 
 
 class Flag:
-    """A boolean that is copied from the device asynchronously; reading it does not wait for later kernels.
-
-    Args:
-        value: bool, a scalar.
-    """
+    """A boolean scalar that is copied from the device asynchronously; reading it does not wait for later kernels."""
 
     def __init__(self, value: Tensor) -> None:
         self._value = value.to("cpu", non_blocking=True)
@@ -105,11 +85,7 @@ class FiniteGuard:
         """Queue the metrics of an update; raise ``NonFiniteLossError`` if those of ``lag`` updates ago are not finite.
 
         The loss alone is no proof: two-hot targets are clamped, so an infinite reward only makes the loss large.
-
-        Args:
-            metrics: Scalars by name.
-            batch: Data that they were computed from.
-            of: Words of the error message after "The loss", such as " of the actor's update"; may be empty.
+        ``of`` are words of the error message after "The loss", such as " of the actor's update".
         """
         watched = [
             value
@@ -131,6 +107,10 @@ Step = Callable[[TensorDictBase], dict[str, Tensor]]
 """Function that computes the losses of a batch ``[B, T]`` and their gradients, and returns scalars by name."""
 
 
+WARMUPS = 3
+"""Calls of a step before its capture, in which libraries allocate memory and choose kernels."""
+
+
 class GraphedStep:
     """Replays a step as one CUDA graph, captured at the first call.
 
@@ -140,33 +120,28 @@ class GraphedStep:
     Args:
         step: Function to capture.
         module: Module whose gradients and buffers the step writes; the buffers are restored after the warm-up.
-        warmups: Calls before the capture, in which libraries allocate memory and choose kernels.
 
     Raises:
         ValueError: At a call, if the shape of the batch is not that of the first.
     """
 
-    def __init__(self, step: Step, module: nn.Module, warmups: int = 3) -> None:
+    def __init__(self, step: Step, module: nn.Module) -> None:
         self._step = step
         self._module = module
-        self._warmups = warmups
         self._graph: torch.cuda.CUDAGraph | None = None
 
     def __call__(self, batch: TensorDictBase) -> dict[str, Tensor]:
         """Run the step on a batch ``[B, T]`` on the CUDA device; return copies of the scalars."""
         with torch.cuda.device(batch.device):  # streams and graphs belong to the current device
-            return self._replay(batch)
-
-    def _replay(self, batch: TensorDictBase) -> dict[str, Tensor]:
-        graph = self._graph or self._capture(batch)
-        if batch.batch_size != self._batch.batch_size:
-            raise ValueError(
-                f"The CUDA graph was captured for a batch of {list(self._batch.batch_size)}, got "
-                f"{list(batch.batch_size)}: keep the shape, or set cuda_graph=False."
-            )
-        self._batch.update_(batch)
-        graph.replay()
-        return dict(zip(self._names, torch.stack(self._scalars).unbind(0), strict=True))
+            graph = self._graph or self._capture(batch)
+            if batch.batch_size != self._batch.batch_size:
+                raise ValueError(
+                    f"The CUDA graph was captured for a batch of {list(self._batch.batch_size)}, got "
+                    f"{list(batch.batch_size)}: keep the shape, or set cuda_graph=False."
+                )
+            self._batch.update_(batch)
+            graph.replay()
+            return dict(zip(self._names, torch.stack(self._scalars).unbind(0), strict=True))
 
     def _capture(self, batch: TensorDictBase) -> torch.cuda.CUDAGraph:
         self._batch = batch.clone()
@@ -175,7 +150,7 @@ class GraphedStep:
         side.wait_stream(torch.cuda.current_stream())
         # The warm-up must change neither random generators nor buffers, because a resumed run repeats it.
         with torch.random.fork_rng(devices=[batch.device]), torch.cuda.stream(side):
-            for _ in range(self._warmups):
+            for _ in range(WARMUPS):
                 self._module.zero_grad(set_to_none=True)
                 self._step(self._batch)
         torch.cuda.current_stream().wait_stream(side)

@@ -28,15 +28,9 @@ from dreamer_racing import parallel
 from dreamer_racing.experience.rollouts import RolloutStorage
 from dreamer_racing.learners.config import LearnerConfig
 from dreamer_racing.learners.gradient_step import restore
-from dreamer_racing.learners.learner import Timer, ValueFunction, untimed
+from dreamer_racing.learners.learner import Timer, untimed
 from dreamer_racing.learners.update import WorldModelLearner
-from dreamer_racing.losses import (
-    LatentPPOLosses,
-    Trajectory,
-    find_objective,
-    normalized,
-    rollout_return,
-)
+from dreamer_racing.losses import LatentPPOLosses, Trajectory, find_objective, normalized, rollout_return
 from dreamer_racing.losses.config import KL_TOLERANCE, PPOUpdateConfig
 from dreamer_racing.modules import Agent
 from dreamer_racing.modules.heads import ActionDistribution, TwoHotHead, symlog
@@ -217,13 +211,9 @@ class LatentPPO(WorldModelLearner):
             **moved,
         }
 
-    def value_function(self) -> ValueFunction:
-        """Return the value function of PPO's critic."""
-        return self._value_of_step
-
     @torch.no_grad()
-    def _value_of_step(self, acted: TensorDictBase) -> Tensor:
-        """Return the values ``(N, 1)`` of records ``[N]`` that `DreamerPolicy` has acted on."""
+    def _value(self, acted: TensorDictBase) -> Tensor:
+        """Return the values ``(N, 1)`` by PPO's critic of records ``[N]`` that `DreamerPolicy` has acted on."""
         if self.loss_config.critic == "state":
             seen = symlog(acted[PRIVILEGED])
         else:  # the latents after the observation are under "next"
@@ -295,13 +285,9 @@ class PPOUpdate:
         )
 
     def run(self, number: int, loss: MinibatchLoss) -> dict[str, Tensor]:
-        """Make epochs of gradient steps; stop early if the KL divergence exceeds ``kl_stop``.
+        """Make epochs of gradient steps on so many records; stop early if the KL divergence exceeds ``kl_stop``.
 
         Steps with a non-finite gradient are skipped.
-
-        Args:
-            number: Number of records to learn from.
-            loss: Loss of a minibatch.
 
         Returns:
             Scalars, averaged over the gradient steps: ``loss``, ``gradient_norm`` before clipping, and the metrics of

@@ -35,13 +35,10 @@ class Policy(Protocol):
 
 
 class Evaluable(Protocol):
-    """Protocol of what can be evaluated: every learner, and a `ShippedAgent`.
-
-    Attributes:
-        device: Where its networks are.
-    """
+    """Protocol of what can be evaluated: every learner, and a `ShippedAgent`."""
 
     device: torch.device
+    """Where its networks are."""
 
     def evaluation_policy(self) -> Policy:
         """Return the policy to evaluate, which may have averaged weights."""
@@ -53,13 +50,10 @@ class Evaluable(Protocol):
 
 
 class Learner(Evaluable, Protocol):
-    """Protocol of learners: `DreamerV3`, `LatentPPO`, `PPOLearner` and `SACLearner`.
-
-    Attributes:
-        updates: Number of updates so far.
-    """
+    """Protocol of learners: `DreamerV3`, `LatentPPO`, `PPOLearner` and `SACLearner`."""
 
     updates: int
+    """Number of updates so far."""
 
     def policy(self) -> Policy:
         """Return the policy that is trained, which shares the learner's parameters."""

@@ -24,13 +24,7 @@ def own_state(network: nn.Module, agent: Agent) -> dict[str, Tensor]:
 
 
 def check_saved(saved: dict[str, Any], algorithm: str, agent: Agent, own_networks: Mapping[str, nn.Module]) -> None:
-    """Check that a saved learner can be resumed by this one.
-
-    Args:
-        saved: ``state_dict()`` of a learner.
-        algorithm: Algorithm of the learner that loads it.
-        agent: Networks of that learner.
-        own_networks: Its networks that are not part of the agent.
+    """Check that ``state_dict()`` of a learner can be resumed by this one.
 
     Raises:
         ValueError: If it was saved with another algorithm, model size, loss or environment.
@@ -60,13 +54,7 @@ class UnmatchedWeights(NamedTuple):
 def check_weights(saved: dict[str, Any], agent: Agent, own_networks: Mapping[str, nn.Module]) -> UnmatchedWeights:
     """Check that the weights of a saved learner can be loaded, whatever its algorithm.
 
-    Args:
-        saved: ``state_dict()`` of a learner.
-        agent: Agent that loads the weights.
-        own_networks: Networks outside the agent; those that were also saved must have the same shapes.
-
-    Returns:
-        The networks outside the agent that only one of the two learners has.
+    Of the networks outside the agent those that were also saved must have the same shapes.
 
     Raises:
         ValueError: If it was saved with another model size or environment.
@@ -85,11 +73,7 @@ def check_weights(saved: dict[str, Any], agent: Agent, own_networks: Mapping[str
 
 
 def check_format(saved: dict[str, Any]) -> None:
-    """Check that the state of a learner has the format of this version.
-
-    Raises:
-        ValueError: If it has an older format.
-    """
+    """Raise ``ValueError`` if the state of a learner has an older format."""
     if "own_networks" not in saved:
         raise ValueError("The checkpoint was saved in a format that this version does not read: train again.")
 
@@ -101,11 +85,7 @@ def load_parameters(module: nn.Module, saved: Mapping[str, Tensor]) -> None:
 
 
 def check_size(checkpoint: dict[str, Any], size: ModelSize) -> None:
-    """Check that a saved model has this size.
-
-    Args:
-        checkpoint: ``state_dict()["size"]`` of a learner.
-        size: Size of the model of the learner that loads it.
+    """Check that a saved model, ``state_dict()["size"]`` of a learner, has this size.
 
     Raises:
         ValueError: If they differ in anything but the name; the message gives the differences and what to do.

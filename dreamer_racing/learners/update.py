@@ -8,7 +8,7 @@ from __future__ import annotations
 import copy
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
-from contextlib import AbstractContextManager, nullcontext
+from contextlib import nullcontext
 from dataclasses import asdict
 from typing import Any, ClassVar, Self
 
@@ -18,7 +18,7 @@ from torch import Tensor, nn
 
 from dreamer_racing import parallel
 from dreamer_racing.learners.config import LearnerConfig
-from dreamer_racing.learners.gradient_step import FiniteGuard, GraphedStep, gradient_norms, make_optimizer, restore
+from dreamer_racing.learners.gradient_step import FiniteGuard, GraphedStep, gradient_norms, restore
 from dreamer_racing.learners.learner import Timer, ValueFunction, seeded, untimed
 from dreamer_racing.learners.saved import UnmatchedWeights, check_saved, check_weights, load_parameters, own_state
 from dreamer_racing.losses import Latents, LossConfig, WorldModelLoss, find_targets, policy_drift, replay_critic_loss
@@ -31,11 +31,6 @@ from dreamer_racing.settings import check_settings
 
 class WorldModelLearner(ABC):
     """Base of learners that minimise the losses of ``compute_losses``.
-
-    Args:
-        agent: The networks, on the device where updates run.
-        losses: Settings of the losses.
-        config: Settings of the update.
 
     Attributes:
         algorithm: Name of the algorithm; a checkpoint belongs to one algorithm.
@@ -127,7 +122,7 @@ class WorldModelLearner(ABC):
         """Learn from a batch of replayed records.
 
         Args:
-            batch: Batch size ``[B, T]``: the encoder's observations, ``previous_action``, ``reward``, ``is_init``,
+            batch: Records ``[B, T]``: the encoder's observations, ``previous_action``, ``reward``, ``is_init``,
                 ``terminated``, ``truncated``, scalars ``(B, T, 1)``; optionally ``context``, the stored latents, from
                 which windows then start, and which ``drift_scale`` requires.
             timed: Makes a context manager that times an activity: ``world_model``, ``imagine`` (actor and critic, even
@@ -186,10 +181,10 @@ class WorldModelLearner(ABC):
 
     def value_function(self) -> ValueFunction:
         """Return the value function of the critic that the actor learns from."""
-        return self._value_of_latents
+        return self._value
 
     @torch.no_grad()
-    def _value_of_latents(self, acted: TensorDictBase) -> Tensor:
+    def _value(self, acted: TensorDictBase) -> Tensor:
         """Return the critic's values ``(N, 1)`` at the latents that `DreamerPolicy` wrote under "next"."""
         after = acted["next"].select("belief", "state").to(self.device)
         return self.evaluation_agent.critic.value(join_features(after["belief"], after["state"]))
@@ -226,12 +221,8 @@ class WorldModelLearner(ABC):
     ) -> dict[str, Tensor]:
         """Return ``loss_replay_critic`` of a batch ``[B, T]``: the agent's critic learns its λ-returns.
 
-        With ``replay_value_gradient`` the latents learn to tell what these depend on, too.
-
-        Args:
-            latents: Current latents of the batch's records.
-            batch: The records.
-            bootstrap: Values ``(B, T, 1)`` with which the returns continue; None for the critic's own.
+        With ``replay_value_gradient`` the latents learn to tell what these depend on, too. The returns continue with
+        the ``bootstrap`` values ``(B, T, 1)``; None for the critic's own.
         """
         numbers = self.loss_config
         features = latents.features if numbers.replay_value_gradient else latents.features.detach()
@@ -241,26 +232,26 @@ class WorldModelLearner(ABC):
         return {"loss_replay_critic": numbers.replay_value_scale * loss}
 
     def stored_and_current_features(self, latents: Latents, batch: TensorDictBase) -> tuple[Tensor, Tensor, Tensor]:
-        """Return the stored and the current features of the same records.
-
-        Args:
-            latents: Current latents of a batch's records.
-            batch: The records ``[B, T]``, with ``context``: each stores the latents of the record before it.
+        """Return the stored and the current features of records; each stores the latents of the one before it.
 
         Returns:
             Stored and current features of all records but the last, ``(B, T - 1, F)`` each, and a bool mask
             ``(B, T - 1, 1)`` that is False where the next record begins an episode, and so stores other latents.
         """
         before = join_features(*self.latent_format.unpack(batch[CONTEXT][:, 1:]))
-        after = join_features(latents.belief[:, :-1], latents.state[:, :-1])
-        return before, after, ~batch["is_init"][:, 1:]
+        return before, latents.features[:, :-1], ~batch["is_init"][:, 1:]
 
     def gradient_step(self, batch: TensorDictBase, timed: Timer) -> dict[str, Tensor]:
         """Make one gradient step on a batch ``[B, T]``; return its losses and metrics as `update` does."""
         batch = batch.to(self.device, non_blocking=True)
         metrics = self._backward(batch, timed) if self._graph is None else self._graph(batch)
         if parallel.num_processes() > 1:
-            metrics = self._of_all_processes(metrics, timed)
+            # One all-reduce of a flat tensor, outside of the captured graph, instead of `DistributedDataParallel`: one
+            # backward pass serves several losses, and a non-finite metric reaches all processes with the gradients, so
+            # that all stop at the same update.
+            with timed("exchange"):
+                networks = (parameter for parameters in self._trained.values() for parameter in parameters)
+                metrics = parallel.average_gradients(networks, metrics) | gradient_norms(self._trained)
         self._guard.check(metrics, batch)
         with timed("optimise"):
             self.optimizer.step()
@@ -272,7 +263,8 @@ class WorldModelLearner(ABC):
 
     def _backward(self, batch: TensorDictBase, timed: Timer = untimed) -> dict[str, Tensor]:
         """Compute losses and gradients of a batch; return detached scalars."""
-        with self.autocast(), self._weights():
+        cast_weights = cast_once(self.modules, torch.bfloat16) if self._casts_once else nullcontext()
+        with self.autocast(), cast_weights:
             metrics = self.compute_losses(batch, timed)
         losses = {key: value for key, value in metrics.items() if key.startswith("loss_")}
         if shapes := {key: tuple(value.shape) for key, value in losses.items() if value.dim()}:
@@ -282,18 +274,6 @@ class WorldModelLearner(ABC):
             total.backward()
             norms = gradient_norms(self._trained)
         return {key: value.detach() for key, value in (metrics | norms | {"loss": total}).items()}
-
-    def _of_all_processes(self, metrics: dict[str, Tensor], timed: Timer) -> dict[str, Tensor]:
-        """Average gradients and metrics over the processes, to those of the joint batch.
-
-        It is one all-reduce of a flat tensor between backward pass and optimiser step, outside of the captured graph,
-        instead of ``DistributedDataParallel``: one backward pass serves several losses, and a non-finite metric reaches
-        all processes with the gradients, so that all stop at the same update.
-        """
-        with timed("exchange"):
-            networks = (parameter for parameters in self._trained.values() for parameter in parameters)
-            metrics = parallel.average_gradients(networks, metrics)
-            return metrics | gradient_norms(self._trained)
 
     @torch.no_grad()
     def average_weights(self) -> None:
@@ -324,11 +304,7 @@ class WorldModelLearner(ABC):
             entropy_scale: Weight of the actor's entropy.
             min_std: Smallest standard deviation of actions, for the trained and the averaged actor.
             max_std: Largest standard deviation of actions, likewise.
-            others: Hyperparameters of other algorithms, which are refused.
-
-        Raises:
-            TypeError: If there are ``others``.
-            ValueError: If ``world_model_rate`` is given without ``rates``.
+            others: Hyperparameters of other algorithms, which are refused by a ``TypeError``.
         """
         if others:
             raise TypeError(
@@ -337,9 +313,8 @@ class WorldModelLearner(ABC):
         if rates is None and world_model_rate != 1.0:
             raise ValueError(f"adjust(world_model_rate={world_model_rate:g}) is a factor on rates: give rates=, too.")
         if rates is not None:
-            for group, rate, share in zip(
-                self.optimizer.param_groups, self._rates, (world_model_rate, 1.0), strict=True
-            ):
+            shares = (world_model_rate, 1.0)
+            for group, rate, share in zip(self.optimizer.param_groups, self._rates, shares, strict=True):
                 group["lr"] = rate * rates * share
         for number, value in ((self.discount, discount), (self.entropy_scale, entropy_scale)):
             if value is not None:
@@ -391,14 +366,11 @@ class WorldModelLearner(ABC):
         self.updates = state_dict["updates"]
 
     def adopt(self, state_dict: dict[str, Any]) -> UnmatchedWeights:
-        """Load the weights of another learner's ``state_dict``, whatever its algorithm.
+        """Load the weights of another learner's ``state_dict``, whatever its algorithm; return what remains unmatched.
 
         They are the weights that were evaluated: the averaged ones if it kept them. Nothing else is loaded: no
         optimiser, counters, bounds of the actor's standard deviation, collected steps or statistics. A network outside
         the agent that the other learner lacks, such as a critic of the state, keeps its initial weights.
-
-        Returns:
-            Networks outside the agent that keep their initial weights, and saved ones that are not loaded.
 
         Raises:
             ValueError: If it was saved with another model size or environment; nothing is changed then.
@@ -420,23 +392,22 @@ class WorldModelLearner(ABC):
         }
 
     def _make_optimizer(self) -> torch.optim.Optimizer:
-        rate, parameters = self.config.learning_rate, self._trained
-        behavior = [parameter for name in self.behavior for parameter in parameters[name]]
+        """Make the optimiser of the 2025 reference, LaProp with adaptive gradient clipping."""
+        from torchrl.trainers.algorithms import DreamerV3Optimizer
+
+        rate = self.config.learning_rate
+        behavior = [parameter for name in self.behavior for parameter in self._trained[name]]
         groups: list[dict[str, Any]] = [
-            {"params": parameters["world_model"], "lr": rate},
+            {"params": self._trained["world_model"], "lr": rate},
             {"params": behavior, "lr": self.config.behavior_learning_rate or rate},
         ]
-        return make_optimizer(groups, self.config.warmup_updates)
+        return DreamerV3Optimizer(groups, lr=rate, warmup_steps=self.config.warmup_updates)
 
     def _make_graph(self) -> GraphedStep:
         """Return ``_backward`` as a step that is replayed as one CUDA graph."""
         if self.device.type != "cuda":
             raise ValueError(f"cuda_graph=True needs a CUDA device, but the learner is on {str(self.device)!r}.")
         return GraphedStep(self._backward, self.modules)
-
-    def _weights(self) -> AbstractContextManager:
-        """Return the context in which weights are cast to bfloat16 once per update, if so configured."""
-        return cast_once(self.modules, torch.bfloat16) if self._casts_once else nullcontext()
 
     def store_latents(self, latents: Latents) -> None:
         """Keep the latents of a batch's records, to refresh those in the replay buffer."""

@@ -3,13 +3,7 @@
 ``find_targets`` and ``find_objective`` also import a user's own ones; ``docs/losses.md`` says how to write them.
 """
 
-from dreamer_racing.losses.config import (
-    HORIZON,
-    DreamerV3Losses,
-    LatentPPOLosses,
-    LossConfig,
-    PPOUpdateConfig,
-)
+from dreamer_racing.losses.config import HORIZON, DreamerV3Losses, LatentPPOLosses, LossConfig, PPOUpdateConfig
 from dreamer_racing.losses.imagination import Imagination, Starts, choose_starts, imagine
 from dreamer_racing.losses.policy import (
     OBJECTIVES,
@@ -24,13 +18,7 @@ from dreamer_racing.losses.policy import (
     reinforce,
     through_dynamics,
 )
-from dreamer_racing.losses.returns import (
-    critic_loss,
-    lambda_return,
-    replay_critic_loss,
-    replay_return,
-    rollout_return,
-)
+from dreamer_racing.losses.returns import critic_loss, lambda_return, replay_critic_loss, replay_return, rollout_return
 from dreamer_racing.losses.world_model import (
     TARGETS,
     Barlow,

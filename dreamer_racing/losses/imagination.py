@@ -47,15 +47,7 @@ class Starts(NamedTuple):
 def choose_starts(
     belief: Tensor, state: Tensor, terminated: Tensor, previous_action: Tensor, number: int | None = None
 ) -> Starts:
-    """Choose the records of a batch from which imagination starts.
-
-    Args:
-        belief: ``(B, T, D)``.
-        state: ``(B, T, S)``.
-        terminated: ``(B, T, 1)``.
-        previous_action: ``(B, T, A)``.
-        number: Number of random records; None for all, in order.
-    """
+    """Choose so many random records of a batch ``(B, T, ...)`` to start imagination from; None for all, in order."""
     starts = Starts(*(value.detach().flatten(0, 1) for value in (belief, state, terminated, previous_action)))
     if number is None:
         return starts
@@ -65,19 +57,9 @@ def choose_starts(
 
 
 def imagine(rssm: RSSM, actor: Actor, belief: Tensor, state: Tensor, horizon: int) -> Imagination:
-    """Let the policy act in the world model.
+    """Let the policy act H times in the world model, starting from beliefs ``(N, D)`` and states ``(N, S)``.
 
     Call it under ``torch.no_grad()`` if no gradient shall flow through the rollout, as with REINFORCE.
-
-    Args:
-        rssm: Dynamics.
-        actor: Policy.
-        belief: Belief of the starts, ``(N, D)``.
-        state: State of the starts, ``(N, S)``.
-        horizon: H, number of actions.
-
-    Returns:
-        The rollout.
     """
     if rssm.few_kernels and not torch.is_grad_enabled():
         return _imagine_few_kernels(rssm, actor, belief, state, horizon)

@@ -13,12 +13,13 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass
-from typing import Any, TypeVar
+from typing import Any
 
 import torch
 from torch import Tensor, nn
 
 from dreamer_racing import parallel
+from dreamer_racing.modules.few_kernels import replaced
 from dreamer_racing.modules.heads import ActionDistribution
 from dreamer_racing.settings import import_own, suggestion
 
@@ -33,13 +34,8 @@ def frozen(*modules: nn.Module) -> Iterator[None]:
         for name, parameter in layer._parameters.items()
         if parameter is not None and parameter.requires_grad
     ]
-    for layer, name, parameter in held:
-        layer._parameters[name] = parameter.detach()  # type: ignore[assignment]  # no parameter, but in its place
-    try:
+    with replaced(held, [parameter.detach() for _, _, parameter in held]):
         yield
-    finally:
-        for layer, name, parameter in held:
-            layer._parameters[name] = parameter
 
 
 @dataclass(frozen=True)
@@ -91,10 +87,9 @@ class Trajectory:
 
 Objective = Callable[..., tuple[Tensor, dict[str, Tensor]]]
 """Loss function of a policy: ``(trajectory, **numbers)`` to a loss and metrics, scalars."""
-Function = TypeVar("Function", bound=Callable)
 
 
-def through_dynamics(objective: Function) -> Function:
+def through_dynamics(objective: Objective) -> Objective:
     """Mark an objective that needs the returns' gradient through the imagined dynamics."""
     objective.through_dynamics = True  # type: ignore[attr-defined]  # functions take attributes
     return objective
@@ -196,14 +191,6 @@ OBJECTIVES: dict[str, Objective] = {"reinforce": reinforce, "dynamics": dynamics
 ON_POLICY = ("clipped",)
 """Objectives of collected steps; the others are of imagined steps."""
 
-REMOVED = {
-    "ppo": "use recipes/latent_ppo.py, where PPO learns from collected steps",
-    "flown_ppo": "use recipes/latent_ppo.py, where the critic learns from collected steps, too",
-    "latent_ppo": "use recipes/latent_ppo.py loss.critic=latent",
-    "asymmetric_ppo": "use recipes/latent_ppo.py loss.critic=state",
-}
-"""Names of removed objectives, and what replaces them."""
-
 
 def find_objective(name: str, collected: bool | None = None) -> Objective:
     """Return an objective by its name, or import your own, given as ``module:function``.
@@ -213,16 +200,13 @@ def find_objective(name: str, collected: bool | None = None) -> Objective:
         collected: Whether it must be an objective of collected (True) or imagined (False) steps; None accepts both.
 
     Raises:
-        ValueError: If there is no such objective, or it needs the other kind of steps; the message lists the known
-            ones, says where the module was searched, or which algorithm uses it.
+        ValueError: If there is no such objective, or it needs the other kind of steps.
     """
     if ":" in name:
         found = import_own(name, f"Objective {name!r}")
         if not callable(found):
             raise ValueError(f"Objective {name!r} is not a function of a Trajectory.")
         return found
-    if name in REMOVED:
-        raise ValueError(f"The actor {name!r} was removed: {REMOVED[name]}.")
     if name not in OBJECTIVES:
         raise ValueError(
             f"Unknown objective {name!r}{suggestion(name, OBJECTIVES)}. Known objectives: {', '.join(OBJECTIVES)}. "

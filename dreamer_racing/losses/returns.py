@@ -23,9 +23,6 @@ def lambda_return(reward: Tensor, next_value: Tensor, discount: Tensor, lambda_:
         discount: γ times the probability that the episode continues there, ``(H, ...)``.
         lambda_: λ, one number or ``(H, ...)``.
 
-    Returns:
-        Returns, ``(H, ...)``.
-
     Reference: DreamerV3, Eq. 7.
     """
     carried = discount * lambda_
@@ -56,14 +53,14 @@ def replay_return(
     Args:
         reward: Received on arriving at each record, ``(B, T, 1)``.
         bootstrap: Value of each record, ``(B, T, 1)``.
-        is_init: Whether each record is its episode's first, bool ``(B, T, 1)``.
-        terminated: bool ``(B, T, 1)``.
-        truncated: bool ``(B, T, 1)``.
+        is_init: Whether each record is its episode's first, bool ``(B, T, 1)``, like the next two.
+        terminated: Whether the episode ended there.
+        truncated: Whether it was cut there.
         discount: γ, a number or a scalar.
         lambda_: λ.
 
     Returns:
-        Returns ``(B, T, 1)``, and weights ``(B, T, 1)``: 0 for records whose return is only their bootstrap, else 1.
+        Returns, and weights ``(B, T, 1)``: 0 for records whose return is only their bootstrap, else 1.
     """
     followed_by_init = torch.cat((is_init[:, 1:], torch.ones_like(is_init[:, :1])), 1)
     last = followed_by_init | terminated | truncated
@@ -97,25 +94,16 @@ def rollout_return(
         terminated: Whether it ended by termination, not by truncation, bool ``(T, N, 1)``.
         discount: γ, a scalar.
         lambda_: λ.
-
-    Returns:
-        Returns ``(T, N, 1)``.
     """
     following = torch.where(done, value, torch.cat((value[1:], value[-1:])))
     return lambda_return(reward, following, discount * (~terminated).float(), lambda_ * (~done).float())
 
 
 def critic_loss(critic: Critic, features: Tensor, returns: Tensor, slow_scale: float) -> tuple[Tensor, Tensor]:
-    """Compute the critic's two-hot regression loss on returns and on the value of its slow copy.
-
-    Args:
-        critic: The module to train.
-        features: ``(..., F)``.
-        returns: ``(..., 1)``.
-        slow_scale: Weight of the regression on the slow copy.
+    """Compute the critic's two-hot regression loss on returns and, times ``slow_scale``, on the value of its slow copy.
 
     Returns:
-        The loss ``(..., 1)``, and the critic's logits ``(..., K)``.
+        The loss ``(..., 1)``, and the critic's logits ``(..., K)``, for features ``(..., F)`` and returns ``(..., 1)``.
 
     Reference: DreamerV3, Eq. 10 and "Critic learning".
     """

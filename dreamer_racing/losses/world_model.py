@@ -199,11 +199,7 @@ def kl_losses(
 
 
 def require_keys(batch: TensorDictBase, keys: list[NestedKey]) -> None:
-    """Check that a batch has all keys.
-
-    Raises:
-        KeyError: If a key is missing; the message lists the missing and the existing ones.
-    """
+    """Raise ``KeyError``, which lists the missing and the existing keys of a batch, if one of ``keys`` is missing."""
     missing = [key for key in keys if batch.get(key, None) is None]
     if missing:
         found = sorted(map(str, batch.keys()))
@@ -365,12 +361,7 @@ class Barlow(Target):
 
 
 def redundancy_reduction(first: Tensor, second: Tensor, off_diagonal_scale: float) -> tuple[Tensor, Tensor]:
-    """Compute the Barlow-Twins objective: correlation one on the diagonal, zero off it.
-
-    Args:
-        first: ``(M, E)``.
-        second: ``(M, E)``.
-        off_diagonal_scale: Weight of the squared correlations off the diagonal.
+    """Compute the Barlow-Twins objective of two ``(M, E)``: correlation one on the diagonal, zero off it.
 
     Returns:
         The loss, a scalar, and the mean correlation on the diagonal, without gradient.
@@ -396,10 +387,7 @@ TARGETS: dict[str, tuple[type[Target], ...]] = {
 
 
 def find_targets(names: str) -> tuple[type[Target], ...]:
-    """Return targets by their names in `TARGETS` or as your own ``module:Class``; several are joined by ``+``.
-
-    Args:
-        names: For example ``reconstruction``, ``my_targets:Mine`` or ``privileged+my_targets:Mine``.
+    """Return targets by names such as ``reconstruction``, ``my_targets:Mine`` or ``privileged+my_targets:Mine``.
 
     Raises:
         ValueError: If a name is unknown; the message lists the known ones, or says where the module was searched.

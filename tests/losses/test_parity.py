@@ -24,7 +24,7 @@ from torchrl.objectives.utils import ValueEstimators
 from dreamer_racing.losses import LossConfig, WorldModelLoss, critic_loss, replay_critic_loss
 from dreamer_racing.modules import SIZES, Critic, Interface, TwoHotHead, WorldModel, join_features
 from dreamer_racing.modules.agent import Agent
-from tests.dreamers import imagine_from, learner_of
+from tests.dreamers import imagine_from, learner_of, make_windows
 
 SIZE = SIZES["debug"]
 HORIZON = 333
@@ -50,25 +50,10 @@ def make_agent() -> Agent:
     return stir(Agent(SIZE, Interface()))
 
 
-def make_batch(batch: int = 3, time: int = 7, crashes: bool = False) -> TensorDict:
+def make_batch(crashes: bool = False) -> TensorDict:
     """Records with a reset in the middle, a cut that only the next reset shows, and maybe crashes."""
-    torch.manual_seed(1)
-    is_init, terminated, truncated = torch.zeros(3, batch, time, 1, dtype=torch.bool).unbind(0)
-    is_init[0, 0] = is_init[1, 3] = is_init[2, 5] = True
-    truncated[1, 2] = True
-    if crashes:
-        terminated[2, 4] = terminated[0, 6] = True
-    return TensorDict(
-        {
-            "pixels": torch.randint(0, 256, (batch, time, 64, 64, 3), dtype=torch.uint8),
-            "previous_action": torch.rand(batch, time, 4) * 2 - 1,
-            "reward": torch.randn(batch, time, 1) * 3,
-            "is_init": is_init,
-            "terminated": terminated,
-            "truncated": truncated,
-        },
-        [batch, time],
-    )
+    places = {"is_init": [(0, 0), (1, 3), (2, 5)], "truncated": [(1, 2)]}
+    return make_windows(3, 7, **places, terminated=[(2, 4), (0, 6)] if crashes else [])
 
 
 def stock_batch(batch: TensorDict) -> TensorDict:
