@@ -27,9 +27,7 @@ def ensure_caches() -> str:
     """Let Warp and Matplotlib use a temporary folder if Warp's own cache is not writable; log one warning.
 
     Call it before importing either. The folder is removed when this process ends; its child processes use it, too.
-
-    Returns:
-        Why Warp's own folder is not used; empty if it is used.
+    Why Warp's own folder is not used is returned; an empty string if it is used.
 
     Raises:
         CacheError: No temporary folder can be made either.

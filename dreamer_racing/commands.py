@@ -45,15 +45,9 @@ def install_extra(extra: str) -> str:
 
 
 def import_extra(module: str, extra: str, needed: str) -> Any:
-    """Import a module that an extra installs.
+    """Import a module that an extra installs; raise ``ImportError`` with the command if it is not installed.
 
-    Args:
-        module: Its name.
-        extra: Name of the extra.
-        needed: What needs which package, for the message.
-
-    Raises:
-        ImportError: It is not installed; the message says how to install it.
+    ``needed`` says in the message what needs which package.
     """
     try:
         return importlib.import_module(module)

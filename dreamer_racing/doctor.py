@@ -75,13 +75,7 @@ class Diagnosis(NamedTuple):
 
 
 def examine(capacity: int, keep: int, run_dir: Path) -> Iterator[Diagnosis]:
-    """Run all checks and yield their results.
-
-    Args:
-        capacity: Records that the replay buffer holds.
-        keep: Number of checkpoints kept.
-        run_dir: Folder of the runs.
-    """
+    """Yield the results of all checks, for a replay of ``capacity`` records and ``keep`` checkpoints in ``run_dir``."""
     probes = {backend: _start_probe(backend) for backend in GL_LIBRARIES}
     yield python()
     yield from packages()

@@ -23,15 +23,12 @@ _M_TRIM_THRESHOLD, _M_MMAP_MAX = -1, -4  # glibc, malloc.h
 
 
 def keep_freed_memory() -> bool:
-    """Make this process keep freed memory instead of returning it to the kernel.
+    """Make this process keep freed memory instead of returning it to the kernel; return whether glibc accepted that.
 
     By default glibc returns blocks of many megabytes at once and requests them again at the next operation, and the
     kernel zeroes every page each time: a third of the time of a large model's update on a CPU
     (``benchmarks/learner.py --return-freed-memory`` measures it). With this setting the process never shrinks and may
     grow; `KeptMemory` limits that. Has no effect on an allocator that is preloaded in place of glibc's.
-
-    Returns:
-        Whether the C library accepted the setting; only glibc does.
     """
     if sys.platform == "win32":
         return False
@@ -90,11 +87,7 @@ def available_memory(device: torch.device | str) -> float:
 
 
 def check_fits(size: int, device: torch.device | str, setting: str) -> None:
-    """Check that ``size`` bytes, which a setting asks for (as the user wrote it), fit in the free memory of a device.
-
-    Raises:
-        ValueError: It does not fit; the message gives both numbers and what to change.
-    """
+    """Raise ``ValueError`` unless ``size`` bytes, which a setting asks for, fit in the free memory of a device."""
     available = available_memory(device)
     if size > available:
         raise ValueError(
@@ -104,12 +97,9 @@ def check_fits(size: int, device: torch.device | str, setting: str) -> None:
 
 
 def check_space(size: int, folder: Path, setting: str) -> None:
-    """Check that files of ``size`` bytes fit on the disk of a folder, which need not exist yet.
+    """Raise ``ValueError`` unless files of ``size`` bytes fit on the disk of a folder, which need not exist yet.
 
     A memory map that runs out of disk space would kill the process.
-
-    Raises:
-        ValueError: They do not fit; the message gives both numbers and what to change.
     """
     place = next(above for above in (folder.absolute(), *folder.absolute().parents) if above.exists())
     free = shutil.disk_usage(place).free

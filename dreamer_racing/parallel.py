@@ -111,33 +111,24 @@ def own_device(device: str) -> str:
     return f"cuda:{os.environ['LOCAL_RANK']}" if device.startswith("cuda") else device
 
 
-def average_(values: Iterable[Tensor]) -> None:
-    """Replace tensors of one device by their mean over the processes, in a single all-reduce."""
-    tensors = list(values)
-    if _here.processes == 1 or not tensors:
-        return
-    flat = torch.cat([tensor.detach().flatten().float() for tensor in tensors])
-    dist.all_reduce(flat)
-    flat /= _here.processes
-    parts = flat.split([tensor.numel() for tensor in tensors])
-    torch._foreach_copy_(tensors, [part.view(tensor.shape) for part, tensor in zip(parts, tensors, strict=True)])
-
-
 def average_gradients(parameters: Iterable[Tensor], metrics: Mapping[str, Tensor] | None = None) -> dict[str, Tensor]:
-    """Average gradients over the processes, in place, to those of the joint batch.
+    """Average gradients over the processes, in place, to those of the joint batch; return the means of metrics.
 
     This is exact if the loss is a mean over records and the processes have equal shares of the batch.
 
     Args:
         parameters: Parameters with the gradients; those without one are skipped, and must be the same in all processes.
         metrics: Tensors on the same device to average in the same all-reduce.
-
-    Returns:
-        The means of the metrics.
     """
-    own = {name: value.clone() for name, value in (metrics or {}).items()}
-    average_([*(parameter.grad for parameter in parameters if parameter.grad is not None), *own.values()])
-    return own
+    means = {name: value.clone() for name, value in (metrics or {}).items()}
+    if _here.processes > 1:
+        tensors = [*(parameter.grad for parameter in parameters if parameter.grad is not None), *means.values()]
+        flat = torch.cat([tensor.detach().flatten().float() for tensor in tensors])
+        dist.all_reduce(flat)
+        flat /= _here.processes
+        parts = flat.split([tensor.numel() for tensor in tensors])
+        torch._foreach_copy_(tensors, [part.view(tensor.shape) for part, tensor in zip(parts, tensors, strict=True)])
+    return means
 
 
 def averaged(metrics: dict[str, Tensor]) -> dict[str, Tensor]:
@@ -213,11 +204,7 @@ def run_in_all(action: Callable[[], object]) -> None:
 
 
 def check_same(values: Sequence[Tensor]) -> None:
-    """Check that the networks are still equal in all processes, by the sums of their tensors.
-
-    Raises:
-        RuntimeError: A sum differs between processes.
-    """
+    """Raise ``RuntimeError`` unless the networks are still equal in all processes, by the sums of their tensors."""
     if _here.processes == 1:
         return
     with torch.no_grad():

@@ -82,11 +82,7 @@ def check_settings(config: Any, prefix: str = "") -> None:
 
 
 def check_setting(name: str, value: object, allowed: Range, whole: bool = False) -> None:
-    """Check that the value of a setting is a number in a range, and whole if asked.
-
-    Raises:
-        ValueError: It is not; the message gives the setting, its value, and what is allowed.
-    """
+    """Raise ``ValueError`` unless the value of a setting is a number in a range, and whole if asked."""
     is_whole = isinstance(value, Integral) or (isinstance(value, Real) and float(value).is_integer())
     if not is_number(value):
         raise ValueError(f"{name}={quoted(value)}: must be a number, {allowed}.")
@@ -98,11 +94,7 @@ def check_setting(name: str, value: object, allowed: Range, whole: bool = False)
 
 
 def check_numbers(whole: Mapping[str, object], real: Mapping[str, object]) -> None:
-    """Check that arguments, given by name, are numbers: ``whole`` ones, or also fractions.
-
-    Raises:
-        ValueError: One is not; the message gives the argument and its value.
-    """
+    """Raise ``ValueError`` unless arguments, given by name, are numbers: ``whole`` ones, or also fractions."""
     for values, kind, words in ((whole, Integral, "a whole number"), (real, Real, "a number")):
         for name, value in values.items():
             if isinstance(value, bool) or not isinstance(value, kind):
@@ -110,11 +102,7 @@ def check_numbers(whole: Mapping[str, object], real: Mapping[str, object]) -> No
 
 
 def check_three(name: str, values: object, allowed: Range) -> None:
-    """Check that a setting is three numbers in a range, one for each axis.
-
-    Raises:
-        ValueError: It is not; the message gives the setting, its value, and what is allowed.
-    """
+    """Raise ``ValueError`` unless a setting is three numbers in a range, one for each axis."""
     three = isinstance(values, Iterable) and not isinstance(values, str) and list(values)
     if not three or len(three) != 3 or not all(value in allowed for value in three):
         raise ValueError(f"{name}={quoted(values)}: must be three numbers, each {allowed}.")
@@ -126,11 +114,7 @@ def without_none(**arguments: object) -> dict[str, object]:
 
 
 def given(value: T | None, field: str, needs_it: str) -> T:
-    """Return a required setting.
-
-    Raises:
-        ValueError: It is None; the message says what needs it.
-    """
+    """Return a required setting; raise ``ValueError``, which says what needs it, if it is None."""
     if value is None:
         raise ValueError(f"{field} is not given: {needs_it} needs it.")
     return value
@@ -142,11 +126,7 @@ def shortened(text: str, length: int = 80) -> str:
 
 
 def check_flags(**flags: object) -> None:
-    """Check that arguments are True or False: a string like "no" would be truthy.
-
-    Raises:
-        ValueError: One is not; the message gives the argument and its value.
-    """
+    """Raise ``ValueError`` unless arguments are True or False: a string like "no" would be truthy."""
     for name, value in flags.items():
         if value is not True and value is not False:
             raise ValueError(f"{name}={quoted(value)}: must be True or False.")
@@ -172,11 +152,7 @@ def wrong_choice(name: str, value: object, known: Collection[str]) -> str:
 
 
 def check_choice(name: str, value: object, known: Collection[str]) -> None:
-    """Refuse a value that is not one of the known ones.
-
-    Raises:
-        ValueError: The message is `wrong_choice`.
-    """
+    """Raise ``ValueError`` with the message `wrong_choice` unless a value is one of the known ones."""
     if value not in known:
         raise ValueError(wrong_choice(name, value, known))
 

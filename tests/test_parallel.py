@@ -139,9 +139,10 @@ def updates_of_shares(folder: Path) -> None:
 
 def exchanges(folder: Path) -> None:
     rank = parallel.rank()
-    values = [torch.full((2, 2), float(rank)), torch.tensor(1.0 + rank)]
-    parallel.average_(values)
-    assert values[0].tolist() == [[0.5, 0.5], [0.5, 0.5]] and values[1] == 1.5
+    still, moved = torch.zeros(2, requires_grad=True), torch.zeros(2, 2, requires_grad=True)
+    moved.grad = torch.full((2, 2), float(rank))
+    means = parallel.average_gradients([still, moved], {"loss": torch.tensor(1.0 + rank)})
+    assert moved.grad.tolist() == [[0.5, 0.5], [0.5, 0.5]] and still.grad is None and means == {"loss": 1.5}
     assert parallel.total(torch.tensor([1.0, rank])).tolist() == [2.0, 1.0]
     assert parallel.all_gather(torch.full((1, 2), rank), dim=1).tolist() == [[0, 0, 1, 1]]
     rows = TensorDict({"return": torch.arange(rank + 1)}, [rank + 1])
