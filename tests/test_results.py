@@ -56,26 +56,42 @@ def test_every_result_is_on_the_page(results):
     assert missing == [], "name them in a provenance.json beside them; the head of docs/results.py says how"
 
 
-def test_cells_without_a_result_say_so(results, folder):
-    page = results.make_page(folder)
-    assert "| PPO | not run | [One: a result](#one-a-result) |" in page
-    assert "## One: a result" in page
-
-
 def test_facts_come_from_the_entry_or_its_records_and_are_never_invented(results, folder):
-    page = results.make_page(folder)
-    said = " ".join(page.split())
+    said = " ".join(results.make_page(folder).split())
     assert "Command: not recorded. Time: not recorded." in said and "Commit: not" not in said  # of its JSON file
-    change(folder, today="python x.py", command="python w.py", machine="N", wall_clock="3 minutes", commit="c3")
-    page = results.make_page(folder)
-    assert "```bash\npython x.py\n```\n\n[Commands, commits, machine]" in page and "not recorded" not in page
-    change(folder, today=["python x.py", "python y.py  # likewise z.py"])
-    assert "```bash\npython x.py\n# likewise z.py\npython y.py\n```" in results.make_page(folder)
 
 
-def test_cells_may_say_what_they_show(results, folder):
-    change(folder, fills={"ppo/b": "99 %"})
-    assert "| PPO | not run | [99 %](#one-a-result) |" in results.make_page(folder)
+FACTS = {"command": "python old.py", "machine": "N", "wall_clock": "3 minutes", "commit": "c3"}
+
+
+@pytest.mark.parametrize(
+    ("fields", "shown", "hidden"),
+    [
+        ({}, ["| PPO | not run | [One: a result](#one-a-result) |", "## One: a result"], []),
+        ({}, ["![A curve](PLACE/curve.png)\n*A curve*\n", "[numbers.json](PLACE/numbers.json)."], []),
+        ({"fills": {"ppo/b": "99 %"}}, ["| PPO | not run | [99 %](#one-a-result) |"], []),
+        (
+            FACTS | {"today": "python x.py"},
+            ["```bash\npython x.py\n```\n\n[Commands, commits, machine](PLACE/provenance.json)."],
+            ["not recorded", "old.py"],
+        ),
+        (
+            {"today": ["python x.py", "python y.py  # likewise z.py"]},
+            ["```bash\npython x.py\n# likewise z.py\npython y.py\n```"],
+            [],
+        ),
+        (
+            {"brief": True, "result": "a figure", "command": "python x.py"},
+            ["| One: a result | a figure | [numbers.json](PLACE/numbers.json) |"],
+            ["## One", "python x.py"],
+        ),
+    ],
+    ids=["cell", "picture and numbers", "cell says what it shows", "command of today", "commands", "brief"],
+)
+def test_what_an_entry_says_is_on_the_page(results, folder, fields, shown, hidden):
+    change(folder, **fields)
+    page = results.make_page(folder).replace(f"../{folder.name}/one/deep", "PLACE")
+    assert all(text in page for text in shown) and not any(text in page for text in hidden)
 
 
 def test_a_planned_table_may_have_a_picture_below_it(results, folder):
@@ -92,20 +108,6 @@ def test_a_planned_table_without_rows_is_its_text(results, folder):
     planned = json.loads((folder / "planned.json").read_text())
     (folder / "planned.json").write_text(json.dumps([*planned, {"title": "Each run", "text": "| a | b |\n|---|---|"}]))
     assert "\n## Each run\n\n| a | b |\n|---|---|\n" in results.make_page(folder)
-
-
-def test_brief_entries_are_rows_of_the_last_table(results, folder):
-    change(folder, brief=True, result="a figure", command="python x.py")
-    page = results.make_page(folder)
-    assert f"| One: a result | a figure | [numbers.json](../{folder.name}/one/deep/numbers.json) |" in page
-    assert "## One" not in page and "python x.py" not in page
-
-
-def test_the_page_prints_what_starts_it_today_and_links_what_was_run(results, folder):
-    change(folder, command="python old.py", today="python new.py", commit="c3")
-    page = results.make_page(folder)
-    assert "```bash\npython new.py\n```" in page and "old.py" not in page
-    assert f"[Commands, commits, machine](../{folder.name}/one/deep/provenance.json)." in page
 
 
 def test_many_files_are_linked_by_their_folder(results, folder):
@@ -131,12 +133,6 @@ def test_long_lines_are_broken_and_tables_are_not(results, folder):
     lines = results.make_page(folder).splitlines()
     assert row in lines and max(len(line) for line in lines if line != row and "](" not in line) <= results.WIDTH
     assert any(line.startswith("    option=value") for line in lines)
-
-
-def test_pictures_are_shown_and_numbers_linked(results, folder):
-    page = results.make_page(folder)
-    place = f"../{folder.name}/one/deep"
-    assert f"![A curve]({place}/curve.png)\n*A curve*\n" in page and f"[numbers.json]({place}/numbers.json)." in page
 
 
 @pytest.mark.parametrize(

@@ -5,24 +5,8 @@
 Every case is a short training by `recipes/dreamer_v3.py` in processes of its own, disturbed in one way and continued
 to its end: by the same command as long as it has no checkpoint, then by `resume=`. It *survived* if the last checkpoint
 then holds what that of an undisturbed run holds, bit for bit, the rows of metrics.csv, wall clock aside, are the same,
-no process left a traceback or another exit status than it should, and what was lost was said. Kinds of faults:
-
-* `kill`: SIGKILL at a random time after the start, as often as asked;
-* `kill by the clock`: the same, saving after every rollout as `checkpoint.minutes` does;
-* `kill early`: SIGKILL just after the n-th file was opened for writing, for every n before the first checkpoint; once a
-  checkpoint is there, the same command is to name it and how to go on;
-* `kill at open`, `kill at rename`, `kill at fsync`: SIGKILL at each of them in the second half of a run, which saves,
-  replaces checkpoints and the best, evaluates, and finishes: just after an opening, just before a rename or an fsync,
-  in a random order, so that of a benchmark that is stopped a fair sample is left;
-* `SIGTERM`: at a random time, which is to end the process with the status 143;
-* `damage`: each file of the newest checkpoint in turn, with 16 bytes in its middle turned, with its second half cut
-  off, removed;
-* `full disk`: no file can grow beyond some size (`RLIMIT_FSIZE`) while checkpoints are saved, from the n-th on, or
-  from then on whatever is written, until the run is resumed;
-* `clock`: the wall clock stands still, or goes backwards;
-* `not finite`: a reward is infinite; it is to end with exit status 1 and the checkpoint before it whole.
-
-The exit status is 1 if any case was not survived, and the last lines say which.
+no process left a traceback or another exit status than it should, and what was lost was said. The methods of `Arena`
+say what they do to a run. The exit status is 1 if any case was not survived, and the last lines say which.
 """
 
 import argparse
@@ -38,7 +22,7 @@ import sys
 import tempfile
 import time
 from collections import Counter
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -174,23 +158,19 @@ class Arena:
 
     def cases(self, kind: str, asked: argparse.Namespace) -> Iterator[Case]:
         """Yield the cases of one of the `KINDS`, as many as is asked."""
-        draw, most = random.Random(asked.seed), asked.most
-        ways: dict[str, Callable[[], Iterator[Case]]] = {
-            "kill": lambda: self.kills("kill", asked.kills, draw),
-            "by_clock": lambda: self.kills(
-                "kill by the clock", max(1, asked.kills // 5), draw, "checkpoint.minutes=1e-6"
-            ),
-            "early": lambda: self.early_kills(most),
-            "open": lambda: self.kills_at_calls("open", most, draw),
-            "rename": lambda: self.kills_at_calls("rename", most, draw),
-            "fsync": lambda: self.kills_at_calls("fsync", most, draw),
-            "sigterm": lambda: self.terminations(asked.sigterms, draw),
-            "damage": lambda: self.damages(most),
-            "disk": self.full_disks,
-            "clock": self.clocks,
-            "not_finite": self.not_finite,
+        draw, most, by_clock = random.Random(asked.seed), asked.most, "checkpoint.minutes=1e-6"  # after every rollout
+        ways: dict[str, Iterator[Case]] = {  # generators, of which one will run
+            "kill": self.kills("kill", asked.kills, draw),
+            "by_clock": self.kills("kill by the clock", max(1, asked.kills // 5), draw, by_clock),
+            "early": self.early_kills(most),
+            **{name: self.kills_at_calls(name, most, draw) for name in ("open", "rename", "fsync")},
+            "sigterm": self.terminations(asked.sigterms, draw),
+            "damage": self.damages(most),
+            "disk": self.full_disks(),
+            "clock": self.clocks(),
+            "not_finite": self.not_finite(),
         }
-        return ways[kind]()
+        return ways[kind]
 
     def kills(self, fault: str, number: int, draw: random.Random, *settings: str) -> Iterator[Case]:
         """Kill so often at random times, go on after each; a run that comes to its end gives way to another."""

@@ -5,14 +5,6 @@
 Each kind of input has a process of its own. A case is either taken or refused by the errors that are promised for it;
 everything else fails it: another error, more than 10 s, a process that dies. An audit hook fails what starts a process,
 opens a connection, compiles a text of the input, or writes, renames or removes anything outside the case's folder.
-
-* `tracks`: track files with turned bytes, pieces of text moved about, and values replaced in their structure; of those
-  taken, every hundredth is flown.
-* `actions`: 256 drones at once, fed float32 of random bits, NaN, infinities and huge numbers; a case is a drone's step.
-* `contracts`: `contract.json` of a shipped agent, treated as the tracks are; every twentieth with its actor.
-* `overrides`: one to three settings of `recipes/dreamer_v3.py` with values of any kind, composed, resolved and checked.
-* `checkpoints`: turned bytes, cut files and pickles that run code in a checkpoint, half of them with checksums that
-  fit again.
 """
 
 import argparse
@@ -30,7 +22,7 @@ import sys
 import tempfile
 import traceback
 from collections import Counter
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any, cast
 
@@ -170,8 +162,8 @@ def fly(track: Track) -> None:
     worlds.step(torch.zeros(2, 4))
 
 
-def tracks(draw: random.Random, folder: Path) -> Iterator[Callable[[], bool]]:
-    """Yield cases that load a spoilt track file."""
+def tracks(draw: random.Random, folder: Path) -> Callable[[], bool]:
+    """Make a case that loads a track file with spoilt text or structure; every hundredth of those taken is flown."""
     texts = [path.read_text(encoding="utf-8") for path in sorted(TRACKS.glob("*.yaml"))]
     file = folder / "track.yaml"
 
@@ -189,12 +181,11 @@ def tracks(draw: random.Random, folder: Path) -> Iterator[Callable[[], bool]]:
         return True
 
     fly(load_track("circle"))  # loads its libraries before the watch begins
-    while True:
-        yield case
+    return case
 
 
-def actions(draw: random.Random, folder: Path) -> Iterator[Callable[[], bool]]:
-    """Yield cases, each a step of `DRONES` drones."""
+def actions(draw: random.Random, folder: Path) -> Callable[[], bool]:
+    """Make a case that is a step of `DRONES` drones fed float32 of random bits, NaN, infinities and huge numbers."""
     generator = torch.Generator().manual_seed(draw.randrange(2**31))
     env = DroneRacingEnv("kidney", num_envs=DRONES, from_pixels=False, seed=0)
     carrier = env.reset()
@@ -213,12 +204,11 @@ def actions(draw: random.Random, folder: Path) -> Iterator[Callable[[], bool]]:
         assert carrier["privileged", "position"].isfinite().all(), "a position is not finite"
         return True
 
-    while True:
-        yield case
+    return case
 
 
-def contracts(draw: random.Random, folder: Path) -> Iterator[Callable[[], bool]]:
-    """Yield cases that read a spoilt contract."""
+def contracts(draw: random.Random, folder: Path) -> Callable[[], bool]:
+    """Make a case that reads a spoilt `contract.json` of a shipped agent; every twentieth with its actor."""
     text = (AGENT / "contract.json").read_text(encoding="utf-8")
     shutil.copytree(AGENT, folder, dirs_exist_ok=True)
     file = folder / "contract.json"
@@ -233,12 +223,11 @@ def contracts(draw: random.Random, folder: Path) -> Iterator[Callable[[], bool]]
             return False
         return True
 
-    while True:
-        yield case
+    return case
 
 
-def overrides(draw: random.Random, folder: Path) -> Iterator[Callable[[], bool]]:
-    """Yield cases that compose, resolve and check a configuration."""
+def overrides(draw: random.Random, folder: Path) -> Callable[[], bool]:
+    """Make a case that composes, resolves and checks up to three settings of `recipes/dreamer_v3.py` of any value."""
     sys.path.insert(0, str(ROOT / "recipes"))
     from composing import entry, launching, options, schema
     from dreamer_v3 import resolve
@@ -274,8 +263,7 @@ def overrides(draw: random.Random, folder: Path) -> Iterator[Callable[[], bool]]
             raise
         return True
 
-    while True:
-        yield case
+    return case
 
 
 class Payload:
@@ -294,8 +282,11 @@ PAYLOADS: tuple[tuple[Any, ...], ...] = (
 )  # fmt: skip
 
 
-def checkpoints(draw: random.Random, folder: Path) -> Iterator[Callable[[], bool]]:
-    """Yield cases that restore a damaged checkpoint."""
+def checkpoints(draw: random.Random, folder: Path) -> Callable[[], bool]:
+    """Make a case that restores a checkpoint with turned bytes, cut files or pickles that run code.
+
+    Half of them have checksums that fit again.
+    """
 
     def run(place: Path) -> RunCheckpoints:
         learner = torch.nn.Linear(30, 30)
@@ -332,8 +323,7 @@ def checkpoints(draw: random.Random, folder: Path) -> Iterator[Callable[[], bool
             return False
         return True
 
-    while True:
-        yield case
+    return case
 
 
 KINDS = {
@@ -358,8 +348,7 @@ def attack(kind: str, cases: int, seed: int) -> dict[str, Any]:
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name).resolve()
         each = DRONES if kind == "actions" else 1
-        ways = KINDS[kind](draw, folder)
-        case = next(ways)
+        case = KINDS[kind](draw, folder)
         case()  # what is loaded on first use is loaded before the watch begins
         platform.processor()  # asks a process, once
         watch(folder)
