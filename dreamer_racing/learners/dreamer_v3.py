@@ -99,7 +99,7 @@ class DreamerV3(WorldModelLearner):
         with timed("imagine"):
             # Imagination: starting from latents of the records, the policy acts H times in the world model.
             number = self.config.imagination_starts
-            starts = choose_starts(*latents, batch["terminated"], batch["previous_action"], number)
+            starts = choose_starts(latents.belief, latents.state, batch["terminated"], batch["previous_action"], number)
             with gradient_of_actions(self.objective, model, critic):
                 imagined, action = imagine(model.rssm, actor, starts.belief, starts.state, self.horizon)
 
