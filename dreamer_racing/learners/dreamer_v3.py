@@ -63,6 +63,7 @@ class DreamerV3(WorldModelLearner):
             device
         )
         self.action_change_scale = torch.tensor(float(losses.action_change_scale), device=device)
+        self.crash_weight = torch.tensor(float(losses.crash_weight), device=device)
         self._actor_learns = torch.ones((), device=device)  # 0 or 1; a tensor, so that a captured CUDA graph reads it
         super().__init__(agent, losses, config)
 
@@ -105,11 +106,10 @@ class DreamerV3(WorldModelLearner):
 
                 # Rewards, probabilities that the episode continues, and λ-returns of the rollout, (H, N, 1) (Eq. 7).
                 value = critic.value(imagined)  # (H + 1, N, 1)
-                reward = model.reward_head.mean(imagined[1:])
-                goes_on = torch.ones_like(reward)
-                if numbers.continuation:
-                    goes_on = model.continue_head.probability(imagined[1:])
-                discount = self.discount * goes_on
+                after = imagined[1:]
+                reward = model.reward_head.mean(after)
+                goes_on = model.continue_head.probability(after) if numbers.continuation else torch.ones_like(reward)
+                discount = self.discount * goes_on.pow(self.crash_weight)
                 returns = lambda_return(reward, value[1:], discount, numbers.lambda_)
 
             # A step's weight is the discounted probability of reaching it: 0 if the start had ended its episode.
@@ -158,18 +158,25 @@ class DreamerV3(WorldModelLearner):
             }
 
     def adjust(
-        self, *, imagination_horizon: float | None = None, action_change_scale: float | None = None, **numbers: Any
+        self,
+        *,
+        imagination_horizon: float | None = None,
+        action_change_scale: float | None = None,
+        crash_weight: float | None = None,
+        **numbers: Any,
     ) -> None:
         """Set scheduled hyperparameters, from the next update on; see `WorldModelLearner.adjust`.
 
         Args:
             imagination_horizon: H, rounded; if it changes, the CUDA graph is captured again.
             action_change_scale: Weight of the changes of the policy's mean from step to step.
+            crash_weight: Power of the predicted probability that an imagined episode continues.
             numbers: Arguments of `WorldModelLearner.adjust`.
         """
         super().adjust(**numbers)
-        if action_change_scale is not None:
-            self.action_change_scale.fill_(action_change_scale)
+        for number, value in ((self.action_change_scale, action_change_scale), (self.crash_weight, crash_weight)):
+            if value is not None:
+                number.fill_(value)
         if imagination_horizon is not None and round(imagination_horizon) != self.horizon:
             self.horizon = round(imagination_horizon)
             if self._graph is not None:

@@ -109,6 +109,8 @@ class DreamerV3Losses(LossConfig):
             imagination (`open_loop_loss`). 0, as in the reference, learns them only at observed latents.
         action_change_scale: Weight of the squared change of the policy's mean from one imagined step to the next
             (`Trajectory.action_change`) in the actor's loss; the reference has none.
+        crash_weight: Power of the predicted probability that an imagined episode continues: a small risk of a crash
+            counts this many times, and above 1 the actor flies with more caution. The reference has 1.
         actor_begin: Number of updates before the actor starts to learn. The gradient through the dynamics is misleading
             while the model is wrong: an actor that starts with the model soon saturates. The reference has 0.
     """
@@ -118,6 +120,7 @@ class DreamerV3Losses(LossConfig):
     continuation: bool = True
     open_loop_steps: int = setting(0, NOT_NEGATIVE)
     action_change_scale: float = setting(0.0, NOT_NEGATIVE)
+    crash_weight: float = setting(1.0, NOT_NEGATIVE)
     actor_begin: int = setting(0, NOT_NEGATIVE)
 
 

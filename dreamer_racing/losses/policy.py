@@ -191,6 +191,14 @@ OBJECTIVES: dict[str, Objective] = {"reinforce": reinforce, "dynamics": dynamics
 ON_POLICY = ("clipped",)
 """Objectives of collected steps; the others are of imagined steps."""
 
+REMOVED = {
+    "ppo": "use recipes/latent_ppo.py, where PPO learns from collected steps",
+    "flown_ppo": "use recipes/latent_ppo.py, where the critic learns from collected steps, too",
+    "latent_ppo": "use recipes/latent_ppo.py loss.critic=latent",
+    "asymmetric_ppo": "use recipes/latent_ppo.py loss.critic=state",
+}
+"""Earlier names, and what replaces them."""
+
 
 def find_objective(name: str, collected: bool | None = None) -> Objective:
     """Return an objective by its name, or import your own, given as ``module:function``.
@@ -207,6 +215,8 @@ def find_objective(name: str, collected: bool | None = None) -> Objective:
         if not callable(found):
             raise ValueError(f"Objective {name!r} is not a function of a Trajectory.")
         return found
+    if name in REMOVED:
+        raise ValueError(f"The actor {name!r} was removed: {REMOVED[name]}.")
     if name not in OBJECTIVES:
         raise ValueError(
             f"Unknown objective {name!r}{suggestion(name, OBJECTIVES)}. Known objectives: {', '.join(OBJECTIVES)}. "

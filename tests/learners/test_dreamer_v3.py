@@ -540,3 +540,22 @@ def test_changes_of_the_policy_are_measured_and_cost_what_is_set():
     assert free["action_change"] == dear["action_change"] > 0
     torch.testing.assert_close(dear["loss_actor"], free["loss_actor"] + 100.0 * free["action_change"])
     assert dearer["loss_actor"] == dear["loss_actor"]
+
+
+def test_a_crash_weighs_what_is_set():
+    def first_update(weight: float, adjusted: float | None = None, continuation: bool = True):
+        learner = learner_of(seed=0, **CONFIG, crash_weight=weight, continuation=continuation)
+        learner.adjust(crash_weight=adjusted)
+        torch.manual_seed(0)
+        with torch.no_grad():  # new heads predict no reward and no value, which no weight changes
+            for parameter in learner.agent.parameters():
+                parameter.add_(0.05 * torch.randn_like(parameter))
+        return learner.update(make_batch())
+
+    once, twice, never = first_update(1.0), first_update(2.0), first_update(1.0, adjusted=0.0)
+    assert once["continuation"] == twice["continuation"] < 1
+    losses = ("loss_actor", "loss_critic", "return_mean")
+    assert all(once[name] != twice[name] for name in losses)
+    ignored = first_update(1.0, continuation=False)
+    assert all(never[name] == ignored[name] for name in losses)
+    assert never["continuation"] < ignored["continuation"] == 1
