@@ -19,8 +19,8 @@ import torch
 from torch import Tensor, nn
 
 from dreamer_racing import parallel
-from dreamer_racing.modules.few_kernels import replaced
 from dreamer_racing.modules.heads import ActionDistribution
+from dreamer_racing.modules.layers import replaced
 from dreamer_racing.settings import import_own, suggestion
 
 

@@ -18,7 +18,7 @@ from torch import Tensor, nn
 from torch.autograd import Function
 from torch.autograd.function import FunctionCtx
 
-from dreamer_racing.modules.layers import BlockLinear, LayerNorm, RMSNorm
+from dreamer_racing.modules.layers import BlockLinear, LayerNorm, RMSNorm, replaced
 
 LAYERS = (nn.Linear, nn.Conv2d, nn.ConvTranspose2d, BlockLinear, LayerNorm, RMSNorm)
 """Layers whose weights, biases and gains are cast; all other parameters stay in float32."""
@@ -42,19 +42,6 @@ def cast_once(module: nn.Module, dtype: torch.dtype) -> Iterator[None]:
     held = [(layer, name, p) for layer in layers for name, p in layer._parameters.items() if p is not None]
     with replaced(held, _Cast.apply(dtype, *(parameter for _, _, parameter in held))):
         yield
-
-
-@contextmanager
-def replaced(held: Sequence[tuple[nn.Module, str, nn.Parameter]], others: Sequence[Tensor]) -> Iterator[None]:
-    """Put other tensors in the place of parameters, each given with its module and name; put these back at the end."""
-    # Not by attribute assignment, which accepts only parameters in place of a parameter.
-    for (layer, name, _), other in zip(held, others, strict=True):
-        layer._parameters[name] = other  # type: ignore[assignment]
-    try:
-        yield
-    finally:
-        for layer, name, parameter in held:
-            layer._parameters[name] = parameter
 
 
 class _Cast(Function):

@@ -10,7 +10,7 @@ Shape legend: N any batch (in a loop, that of one step), I input features, O out
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, nullcontext
 from typing import Any
 
@@ -34,6 +34,19 @@ def autocast(device: torch.device, enabled: bool) -> torch.autocast:
     """
     kind = device.type if torch.amp.is_autocast_available(device.type) else "cpu"
     return torch.autocast(kind, torch.bfloat16, enabled=enabled, cache_enabled=False)
+
+
+@contextmanager
+def replaced(held: Sequence[tuple[nn.Module, str, nn.Parameter]], others: Sequence[Tensor]) -> Iterator[None]:
+    """Put other tensors in the place of parameters, each given with its module and name; put these back at the end."""
+    # Not by attribute assignment, which accepts only parameters in place of a parameter.
+    for (layer, name, _), other in zip(held, others, strict=True):
+        layer._parameters[name] = other  # type: ignore[assignment]
+    try:
+        yield
+    finally:
+        for layer, name, parameter in held:
+            layer._parameters[name] = parameter
 
 
 def initialize(weight: Tensor, fan_in: int, scale: float = 1.0) -> None:
