@@ -99,7 +99,7 @@ class Rollout(NamedTuple):
 
     def returns(self, learner: WorldModelLearner) -> Tensor:
         """Return the λ-returns, ``(H, N, 1)``."""
-        discount = learner.discount * self.continuation
+        discount = learner.discount * self.continuation ** getattr(learner, "crash_weight", 1.0)
         return lambda_return(self.reward, self.value[1:], discount, learner.loss_config.lambda_)
 
     def reached(self) -> Tensor:
@@ -176,7 +176,8 @@ def gradient(learner: WorldModelLearner, starts: TensorDict, objective: str) -> 
         rollout, features, action = imagined(learner, starts["belief"], starts["state"])
         returns = rollout.returns(learner)
     discounts = learner.discount ** torch.arange(learner.horizon).view(-1, 1, 1)
-    weight = (1.0 - starts["terminated"].float()) * discounts * rollout.reached()[:-1].detach()
+    reached = rollout.reached()[:-1].detach() ** getattr(learner, "crash_weight", 1.0)
+    weight = (1.0 - starts["terminated"].float()) * discounts * reached
     score = None if through_dynamics else agent.actor(features[:-1]).log_prob(action)
     gain = returns if score is None else score * (returns - rollout.value[:-1])
     gradients = torch.autograd.grad(-(weight * gain).mean(), list(agent.actor.parameters()))

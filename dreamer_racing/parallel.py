@@ -123,6 +123,8 @@ def average_gradients(parameters: Iterable[Tensor], metrics: Mapping[str, Tensor
     means = {name: value.clone() for name, value in (metrics or {}).items()}
     if _here.processes > 1:
         tensors = [*(parameter.grad for parameter in parameters if parameter.grad is not None), *means.values()]
+        if not tensors:
+            return means
         flat = torch.cat([tensor.detach().flatten().float() for tensor in tensors])
         dist.all_reduce(flat)
         flat /= _here.processes

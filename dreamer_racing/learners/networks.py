@@ -197,7 +197,7 @@ def check_layers(saved: dict[str, Any], present: dict[str, Any]) -> None:
             f"The checkpoint's networks were made with env.from_pixels={there}, this learner's with {here}: set "
             f"env.from_pixels={there}, or start a new run."
         )
-    if (there := saved["imu"]) is not present["imu"]:
+    if (there := saved.get("imu", False)) is not present["imu"]:  # earlier ones had no IMU
         raise ValueError(
             f"The checkpoint's networks were made {'with' if there else 'without'} env.imu, and this learner's are "
             f"made {'without' if there else 'with'} it: set it as it was, or start a new run."

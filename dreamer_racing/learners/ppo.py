@@ -129,7 +129,12 @@ class PPOLearner(BaselineLearner):
 
         Raises:
             NonFiniteLossError: If a loss or gradient is not finite.
+            ValueError: If there are fewer records than minibatches.
         """
+        if rollout.numel() < self.config.minibatches:
+            raise ValueError(
+                f"minibatches={self.config.minibatches}: must be at most {rollout.numel()}, the rollout's records."
+            )
         with timed("advantages"):
             records = self.with_advantages(rollout)
         steps: list[dict[str, Tensor]] = []

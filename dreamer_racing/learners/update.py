@@ -305,6 +305,9 @@ class WorldModelLearner(ABC):
             min_std: Smallest standard deviation of actions, for the trained and the averaged actor.
             max_std: Largest standard deviation of actions, likewise.
             others: Hyperparameters of other algorithms, which are refused by a ``TypeError``.
+
+        Raises:
+            ValueError: If ``world_model_rate`` is given without ``rates``.
         """
         if others:
             raise TypeError(

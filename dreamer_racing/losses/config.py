@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 
 from dreamer_racing.modules.heads import MAX_STD, MIN_STD
-from dreamer_racing.settings import COUNT, NOT_NEGATIVE, POSITIVE, POSITIVE_SHARE, SHARE, setting
+from dreamer_racing.settings import COUNT, NOT_NEGATIVE, POSITIVE, POSITIVE_SHARE, SHARE, Range, setting
 
 HORIZON = 16
 """Default of H, imagined actions from each start; recipes set ``model.imagination_horizon``.
@@ -110,7 +110,8 @@ class DreamerV3Losses(LossConfig):
         action_change_scale: Weight of the squared change of the policy's mean from one imagined step to the next
             (`Trajectory.action_change`) in the actor's loss; the reference has none.
         crash_weight: Power of the predicted probability that an imagined episode continues: a small risk of a crash
-            counts this many times, and above 1 the actor flies with more caution. The reference has 1.
+            counts this many times, and the actor flies with more caution. Values are then below
+            the expected returns. The reference has 1.
         actor_begin: Number of updates before the actor starts to learn. The gradient through the dynamics is misleading
             while the model is wrong: an actor that starts with the model soon saturates. The reference has 0.
     """
@@ -120,7 +121,7 @@ class DreamerV3Losses(LossConfig):
     continuation: bool = True
     open_loop_steps: int = setting(0, NOT_NEGATIVE)
     action_change_scale: float = setting(0.0, NOT_NEGATIVE)
-    crash_weight: float = setting(1.0, NOT_NEGATIVE)
+    crash_weight: float = setting(1.0, Range(1))
     actor_begin: int = setting(0, NOT_NEGATIVE)
 
 

@@ -30,6 +30,11 @@ class Agent(nn.Module):
         decode: Whether the world model has decoders of the observations.
         min_std: Smallest standard deviation of actions.
         max_std: Largest standard deviation of actions.
+
+    Attributes:
+        world_model: Encoder, dynamics, decoders, reward and continue heads.
+        actor: Policy head.
+        critic: Value function with its slow copy.
     """
 
     def __init__(

@@ -30,7 +30,7 @@ class Interface:
         image_size: Height and width of those images, pixels.
         vector_dim: V, width of the vector that the agent sees under ``vector_key``; 0 if none.
         privileged_dim: P, width of ``("privileged", "vector")``, which losses may use; 0 if none.
-        vector_key: ``"vector"`` or ``"imu"``.
+        vector_key: Key of the vector that the agent sees, ``"vector"`` or ``"imu"``.
 
     Raises:
         ValueError: If the agent would see nothing.

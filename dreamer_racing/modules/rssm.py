@@ -318,10 +318,17 @@ class RSSM(nn.Module):
     def imagine_few_kernels(
         self, belief: Tensor, features: Tensor, action: Tensor, noise: Tensor, following: Tensor
     ) -> Tensor:
-        """Do the same as ``imagine_step``, but cast latents only once, and write the next ones to ``following``.
+        """Do the same as ``imagine_step``, but cast latents only once, and write the next ones into a given tensor.
 
-        It holds zeros, and like ``features`` belief and state in autocast's type, ``(N, F)``. The noise is
-        ``(N, L, 1)``. The next belief is also returned, in its own type.
+        Args:
+            belief: ``(N, D)``.
+            features: Belief and state in autocast's type, ``(N, F)``.
+            action: ``(N, A)``.
+            noise: ``(N, L, 1)``.
+            following: Zeros of that type, ``(N, F)``, to which the next belief and state are written.
+
+        Returns:
+            The next belief, in the type of ``belief``.
         """
         width = belief.shape[-1]
         action = self.cell.project_action(action.clamp(-1.0, 1.0))

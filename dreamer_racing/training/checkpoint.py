@@ -221,7 +221,7 @@ class RunCheckpoints:
 
 
 class BestCheckpoint:
-    """Keeps the parts as they were at the best evaluation so far, of ``score``, below ``<run_dir>/best``.
+    """Keeps the parts as they were at the best evaluation so far, in ``<run_dir>/best``; its ``score`` is None before.
 
     A best checkpoint of more ``env_steps`` than those at which the run starts or resumes belongs to a part of the run
     that is now repeated: it is moved to ``<run_dir>/best.replaced``.

@@ -18,7 +18,8 @@ MEMORY = 200
 KNOWN_PASS_RATE = 0.4
 """Pass rate of the gate with the lowest one above which the whole lap counts as known [choice]."""
 MIN_PROGRESS_RATE = 3.0
-"""Minimum increase of `GatePassRate.progress` per length of the run, once the lap is known [choice]."""
+"""Minimum increase of `GatePassRate.progress` per length of the run, once the lap is known [choice]: 0.4 in 200,000 of
+1,500,000 env_steps."""
 
 
 class EpisodeTracker:

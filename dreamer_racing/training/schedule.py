@@ -294,6 +294,7 @@ class ModelLag:
 
     A policy that improves faster than its model reaches states where the model is wrong, and exploits the errors that
     promise the most reward. Then the error on the newest records exceeds that in training, and the policy should wait.
+    The newest records are those of all environments: those of a single one vary too much from flight to flight.
     While flights get faster, new records are harder than old ones, so a ratio slightly above 1 is no lag.
 
     Args:

@@ -121,7 +121,6 @@ def check_read(config: DictConfig, overrides: Sequence[str]) -> None:
         return any(issubclass(kind, reader) or not kind.__module__.startswith("dreamer_racing.") for kind in targets)
 
     images = have(Image) and config.env.from_pixels
-    waits = config.algorithm != "latent_ppo" or config.schedule.wait_for_model is not None
     drift = config.loss.drift_scale == 0 or (config.replay.context and not config.model.sampled)
     given = {override_key(override) for override in overrides}
     for name, read, reader in (
@@ -131,10 +130,11 @@ def check_read(config: DictConfig, overrides: Sequence[str]) -> None:
         ("loss.barlow_scale", have(Barlow), "loss=decoder_free"),
         ("model.imagination_starts", config.algorithm == "dreamer_v3", "recipes/dreamer_v3.py, which imagines"),
         ("model.imagination_every", config.algorithm == "dreamer_v3", "recipes/dreamer_v3.py, which imagines"),
+        ("loss.crash_weight", config.loss.get("continuation", True), "loss.continuation=true"),
         ("loss.drift_scale", drift, "stored latents (replay.context=true) without sampling (model.sampled=false)"),
         ("replay.recent_records", config.replay.recent_share > 0, "replay.recent_share above 0"),
         ("replay.device", config.replay.storage is Storage.tensor, "replay.storage=tensor"),
-        ("schedule.wait_every", waits, "schedule.wait_for_model"),
+        ("schedule.wait_every", config.schedule.get("wait_for_model", 0) is not None, "schedule.wait_for_model"),
     ):
         if name in given and not read and (value := OmegaConf.select(config, name)) is not None:
             raise ValueError(f"{name}={value} is for {reader}, which is not chosen: choose that, or leave {name}= out.")

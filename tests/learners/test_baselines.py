@@ -149,6 +149,11 @@ def test_there_are_as_many_minibatches_as_were_asked_for(minibatches: int, steps
     assert {int(state["step"]) for state in learner.optimizer.state.values()} == {steps}
 
 
+def test_more_minibatches_than_records_are_refused() -> None:
+    with pytest.raises(ValueError, match="minibatches=49: must be at most 48"):
+        PPOLearner(SMALL, NUMBERS, PPOConfig(minibatches=49), seed=0).update(random_rollout(num_envs=4, steps=12))
+
+
 # Networks of the baselines: what they read, in which order, and what the acting step writes.
 
 

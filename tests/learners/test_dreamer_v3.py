@@ -260,7 +260,9 @@ def test_what_would_spoil_the_networks_is_refused(spoil):
         assert torch.equal(value, before[name]), name
 
 
-@pytest.mark.parametrize(("recurrence", "norm"), [("block", "layer"), ("dense", "rms")])
+@pytest.mark.parametrize(
+    ("recurrence", "norm"), [("block", "rms"), ("block", "layer"), ("dense", "rms"), ("dense", "layer")]
+)
 def test_mixed_precision_is_close_to_full(recurrence, norm):
     size = replace(SIZES["debug"], name="variant", recurrence=recurrence, blocks=2, norm=norm)
     results = []
@@ -559,3 +561,9 @@ def test_a_crash_weighs_what_is_set():
     ignored = first_update(1.0, continuation=False)
     assert all(never[name] == ignored[name] for name in losses)
     assert never["continuation"] < ignored["continuation"] == 1
+    halved = learner_of(seed=0, **CONFIG, discount=0.9, crash_weight=2.0)
+    for parameter in halved.agent.world_model.continue_head.mlp.output.parameters():
+        torch.nn.init.zeros_(parameter)  # the episode continues with probability 1/2
+    weight = imagine_from(halved, *make_starts())[1].weight
+    expected = [1.0, 0.9 * 0.5**2, (0.9 * 0.5**2) ** 2, (0.9 * 0.5**2) ** 3]
+    torch.testing.assert_close(weight, torch.tensor(expected).view(-1, 1, 1).expand_as(weight))

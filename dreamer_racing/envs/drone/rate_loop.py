@@ -24,7 +24,7 @@ from torch import Tensor
 from dreamer_racing.envs.drone import betaflight
 from dreamer_racing.envs.drone.betaflight import full_stick
 from dreamer_racing.envs.drone.parameters import GRAVITY, QuadrotorParameters
-from dreamer_racing.envs.simulator.warp_device import load_warp
+from dreamer_racing.envs.simulator.warp_device import load_warp, scope
 
 DEGREES = 57.29577951308232  # per radian
 
@@ -107,7 +107,8 @@ class RateLoop:
         (given_setpoint, given_rates, commands), launch = self._advance
         given_setpoint.copy_(setpoint)
         given_rates.copy_(body_rates)
-        launch.launch()
+        with scope(self.state.device):
+            launch.launch()
         return commands.clone()
 
     @cached_property
@@ -116,8 +117,8 @@ class RateLoop:
         warp, like = load_warp(), self.state
         buffers = [like.new_empty(len(like), size) for size in (4, 3, 4)]
         inputs = [self.constants, *map(warp.from_torch, buffers), *arrays(self, like)]
-        kernel, device = make_kernels(like.dtype)[2], warp.device_from_torch(like.device)
-        return buffers, warp.launch(kernel, len(like), inputs=inputs, device=device, record_cmd=True)
+        with scope(like.device):
+            return buffers, warp.launch(make_kernels(like.dtype)[2], len(like), inputs=inputs, record_cmd=True)
 
     @cached_property
     def constants(self) -> Any:
