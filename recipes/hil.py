@@ -52,6 +52,7 @@ from dreamer_racing.hil.pose import PoseSource
 from dreamer_racing.hil.progress import flying_laps
 from dreamer_racing.hil.recording import FILE, TRACK, Flight, FlightRecorder
 from dreamer_racing.hil.view import LiveView
+from dreamer_racing.settings import check_settings
 
 STATISTICS = "statistics.json"
 plain_hil_errors = partial(plain_errors, also=(ImportError,))
@@ -186,6 +187,7 @@ def replay(config: HilConfig) -> int:
             f"({str(error).partition(chr(10))[0]}): replay it with the version named in its recording."
         ) from error
     settings = cast(HilConfig, flown)
+    check_settings(settings)
     if not flight.holds_track:
         print("note: the recording does not contain its track; the current version of the track is used")
     track = flight.track()

@@ -114,7 +114,8 @@ def learning_curves(
     of running means over a window, in units of the axis, by default 2 % of the longest run.
 
     Raises:
-        ValueError: there are no runs or values, a name is unknown, or two runs of one curve have the same seed.
+        ValueError: there are no runs or values, a quantity or the axis is unknown, or two runs of one curve have the
+            same seed.
     """
     wanted_columns(quantities, axis)
     if not runs:

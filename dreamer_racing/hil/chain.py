@@ -26,6 +26,7 @@ from dreamer_racing.hil.progress import GateProgress
 from dreamer_racing.hil.safety import Safety, SafetyLimits, Tick, Verdict
 from dreamer_racing.hil.stamping import PoseClock, Stamping, extrapolate
 from dreamer_racing.hil.vehicle import GRAVITY, Pose, Setpoint
+from dreamer_racing.settings import Range, check_setting
 
 LIFT = 1.35
 """Multiple of the weight to which take-off thrust ramps up within `SafetyLimits.lift_time` [choice]. It starts at 1: a
@@ -104,8 +105,8 @@ class FlightChain:
         renderer: As in `NoseCamera`.
 
     Raises:
-        ValueError: The camera's frame rate does not fit the flyer's rate, or the lift is not within its range and
-            safety's limits.
+        ValueError: The camera's frame rate does not fit the flyer's rate, the latency is out of range, or the lift is
+            not within its range and safety's limits.
         RendererUnavailableError: The camera's images cannot be rendered here.
 
     Attributes:
@@ -117,6 +118,7 @@ class FlightChain:
     """
 
     def __init__(self, flyer: Flyer, track: Track, config: ChainConfig, renderer: str = "auto") -> None:
+        check_setting("latency", config.latency, Range(0, 1))
         self.progress = GateProgress(track, config.limits)
         self.clock = PoseClock(config.stamping, config.latency, config.limits.clock_drift_max)
         self.safety = Safety(config.limits)

@@ -338,8 +338,16 @@ def check_battery(config: HilConfig, thrust: ThrustMap) -> None:
 
 def make_pose_source(config: HilConfig) -> PoseSource:
     """Open the source of poses."""
-    names = ("pose", "pose_host", "pose_port", "pose_device", "pose_baud", "pose_topic", "pose_message", "smoothing")
-    return make_poses(*(getattr(config, name) for name in names))
+    return make_poses(
+        config.pose,
+        host=config.pose_host,
+        port=config.pose_port,
+        device=config.pose_device,
+        baud=config.pose_baud,
+        topic=config.pose_topic,
+        message=config.pose_message,
+        smoothing=config.smoothing,
+    )
 
 
 def make_operator(config: HilConfig) -> OperatorSource:

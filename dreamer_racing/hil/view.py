@@ -1,8 +1,8 @@
 """A web page that shows a flight live: the actor's image, state, target gate and speed.
 
-`LiveView.show` is one of `FlightLoop`'s ``watchers``. Without waiting, it hands a frame to a thread, or drops it if the
-last ones are still on their way. The thread sends it by a pipe to a separate process at the lowest priority, which
-serves the page; it is this file run as a script:
+`LiveView.show` is one of `FlightLoop`'s ``watchers``. Without waiting, it leaves the newest frame to a thread,
+which sends it by a pipe to a separate process at the lowest priority. That serves the page; it is this file run as a
+script:
 
 | path | what |
 |---|---|
@@ -25,8 +25,8 @@ import subprocess
 import sys
 import threading
 import time
+from collections import deque
 from contextlib import suppress
-from functools import partial
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from typing import IO, TYPE_CHECKING, Any, NamedTuple
 
@@ -65,6 +65,7 @@ class LiveView:
         from dreamer_racing.hil.background_worker import BackgroundWorker  # not needed by the serving process
 
         self._shown = 0
+        self._newest: deque[tuple[dict[str, Any], bytes]] = deque(maxlen=1)  # not sent yet
         with _listen(port) as listening:
             self.address = f"http://127.0.0.1:{listening.getsockname()[1]}/"
             self._server, self._pipe = _start_server(listening)
@@ -73,11 +74,13 @@ class LiveView:
     def show(self, outputs: Outputs) -> None:
         """Show the outputs of a tick, without blocking."""
         pixels = b"" if outputs.image is None else outputs.image.tobytes()
-        self._worker.submit(partial(self._send, (self._numbers(outputs), pixels)))
+        self._newest.append((self._numbers(outputs), pixels))
+        self._worker.submit(self._send)
 
-    def _send(self, frame: tuple[dict[str, Any], bytes]) -> None:
-        marshal.dump(frame, self._pipe)  # a tenth of JSON's time
-        self._pipe.flush()
+    def _send(self) -> None:
+        if self._newest:
+            marshal.dump(self._newest.popleft(), self._pipe)  # a tenth of JSON's time
+            self._pipe.flush()
 
     def _numbers(self, outputs: Outputs) -> dict[str, Any]:
         verdict, pose, image = outputs.verdict, outputs.pose, outputs.image

@@ -596,6 +596,12 @@ def test_a_lift_that_lifts_nothing_or_is_clipped_is_refused(lift, limits):
         FlightChain(Hover(), CIRCLE, config)
 
 
+@pytest.mark.parametrize("latency", [-1, 1.5, np.nan, "0"])
+def test_a_latency_that_is_no_time_is_refused(latency):
+    with pytest.raises(ValueError, match=f"latency={latency!r}: must be (a number, )?at least 0 and at most 1"):
+        FlightChain(Hover(), CIRCLE, ChainConfig(SafetyLimits.of_track(CIRCLE), latency=latency))
+
+
 @pytest.mark.parametrize("name", ["figure8", "kidney"])
 def test_shipped_agents_fly_a_lap_from_the_stand(name):
     flyer = ActorFlyer(AGENTS / name)

@@ -31,7 +31,7 @@ from dreamer_racing.hil.progress import GateProgress
 from dreamer_racing.hil.safety import State, Verdict
 from dreamer_racing.hil.safety_limits import SafetyLimits
 from dreamer_racing.hil.vehicle import Command, Pose, at_rest, hover
-from dreamer_racing.hil.view import LiveView
+from dreamer_racing.hil.view import LiveView, _listen
 
 IMAGE = np.zeros((64, 64, 3), np.uint8)
 IMAGE[:32], IMAGE[32:] = (255, 0, 0), (0, 0, 255)  # red above blue
@@ -133,6 +133,11 @@ def test_other_addresses_are_not_there(view):
     for path in ("image.jpg", "etc/passwd", "../view.py"):
         with pytest.raises(urllib.error.HTTPError, match="404"):
             get(view, path)
+
+
+def test_only_this_machine_sees_the_page():
+    with _listen(0) as listening:
+        assert listening.getsockname()[0] == "127.0.0.1"
 
 
 def test_a_port_in_use_is_said(view):

@@ -51,7 +51,7 @@ class LinkConfig:
     host: str = "127.0.0.1"
     port: int | None = setting(None, Range(1, 65535))
     device: str | None = None
-    baud: int | None = None
+    baud: int | None = setting(None, Range(1))
     rates: RateMap | None = None
     thrust: ThrustMap | None = None
     arm_channel: int = FIRST_SWITCH

@@ -11,7 +11,7 @@ from dreamer_racing.hil.links.serial_port import SerialPort, serial_settings
 from dreamer_racing.hil.pose import PoseSource, UdpPose
 from dreamer_racing.hil.pose_sources import mavlink, ros2
 from dreamer_racing.hil.pose_sources.messages import SMOOTHING
-from dreamer_racing.settings import check_choice, given
+from dreamer_racing.settings import Range, check_choice, check_setting, given
 
 POSE_SOURCES = {"udp": (), "mavlink": tuple(mavlink.MESSAGES), "ros2": tuple(ros2.MESSAGES)}
 """Types of messages that each source reads; the first one is its default."""
@@ -51,6 +51,9 @@ def make_poses(
         >>> make_poses("udp", port=0).close()
     """
     check_choice("name", name, POSE_SOURCES)
+    check_setting("smoothing", smoothing, Range(0, 1))
+    if baud is not None:
+        check_setting("baud", baud, Range(1), whole=True)
     user, known = f"the pose source {name}", POSE_SOURCES[name]
     if name == "udp":
         return UdpPose(given(port, "port", user), host)

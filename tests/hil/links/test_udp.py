@@ -229,6 +229,11 @@ def test_ports_that_are_none(port):
         make_link(LinkConfig("udp", port=port))
 
 
+def test_a_baud_rate_of_zero_is_none():
+    with pytest.raises(ValueError, match="baud=0: must be at least 1"):
+        LinkConfig("crsf", device="/dev/null", baud=0)
+
+
 @pytest.mark.parametrize("arm_channel", [-1, 3, 16])
 def test_a_stick_arms_nothing(arm_channel):
     with pytest.raises(ValueError, match=f"arm_channel={arm_channel}: must be 4"):

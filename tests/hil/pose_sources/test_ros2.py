@@ -226,3 +226,8 @@ def test_udp_is_the_pose_packet():
 def test_what_is_missing_or_unknown_is_named(settings, message):
     with pytest.raises(ValueError, match=f"^{re.escape(message)}$"):
         make_poses(**settings)
+
+
+def test_a_smoothing_that_is_no_time_is_refused():
+    with pytest.raises(ValueError, match="smoothing=nan: must be at least 0 and at most 1"):
+        make_poses("udp", port=0, smoothing=math.nan)
