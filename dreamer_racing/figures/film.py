@@ -41,10 +41,11 @@ SEEN = "seen"
 logger = logging.getLogger(__name__)
 
 
-def write_video(path: str | Path, frames: np.ndarray | torch.Tensor, fps: float = 50) -> bool:
+def write_video(path: str | Path, frames: np.ndarray | torch.Tensor, fps: float = 50, scale: int | None = 1) -> bool:
     """Write an H.264 (yuv420p) mp4 file, which most players support; return whether there was an ffmpeg to do it.
 
-    Odd sizes grow by one pixel, because H.264 needs even ones.
+    Pixels are enlarged by the factor ``scale``, None for that of `enlarge_to_watch`. Odd sizes then grow by one pixel,
+    because H.264 needs even ones.
 
     Raises:
         ValueError: the frames have another shape or type, or there are none.
@@ -59,7 +60,9 @@ def write_video(path: str | Path, frames: np.ndarray | torch.Tensor, fps: float 
         writer: Any = imageio.get_writer(partial, format="FFMPEG", fps=fps, **looks)
         with writer:
             for frame in array:
-                writer.append_data(_make_even(frame))
+                # One by one, as a whole film is large
+                larger = enlarge_to_watch(frame[None])[0] if scale is None else enlarge(frame, scale)
+                writer.append_data(_make_even(larger))
     return True
 
 

@@ -24,7 +24,7 @@ from dreamer_racing.figures.curves import (
     wanted_columns,
     write_curves,
 )
-from dreamer_racing.figures.film import dream_video, enlarge, write_gif, write_video
+from dreamer_racing.figures.film import dream_video, write_gif, write_video
 from dreamer_racing.figures.flights import NamedFlight, plot_dreams, plot_flights
 from dreamer_racing.figures.learning import plot_comparison, plot_learning_curves
 from dreamer_racing.figures.profiles import PROFILE_AXES
@@ -203,7 +203,7 @@ def draw_dreams(name: str, stages: dict[Path, Dream], problems: list[str], outpu
     dreams = [(stage_name(file), dream) for file, dream in stages.items()]
     plot_dreams(dreams, output / f"{name}.png", problems=problems)
     fps, film = 1 / (VIDEO_SLOWER * dreams[0][1].frame_dt), dream_video(dreams)
-    filmed = write_video(output / f"{name}.mp4", enlarge(film, 2), fps=fps)
+    filmed = write_video(output / f"{name}.mp4", film, fps=fps, scale=2)
     write_gif(output / f"{name}.gif", film, fps=fps)
     return [f"{name}.png", *([f"{name}.mp4"] if filmed else []), f"{name}.gif"], problems
 

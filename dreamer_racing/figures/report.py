@@ -203,7 +203,7 @@ class ReturnReport:
             folder.mkdir(parents=True, exist_ok=True)
         (into.evaluations / f"{name}.json").write_text(json.dumps(numbers, indent=2))
         if frames:
-            write_video(into.videos / f"{name}.mp4", enlarge_to_watch(torch.stack(frames).cpu().numpy()), fps=30)
+            write_video(into.videos / f"{name}.mp4", torch.stack(frames), fps=30, scale=None)
 
     def close(self) -> None:
         """Close the evaluation's environments."""

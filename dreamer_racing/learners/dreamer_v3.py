@@ -18,7 +18,7 @@ from dreamer_racing import parallel
 from dreamer_racing.learners.config import LearnerConfig
 from dreamer_racing.learners.gradient_step import GraphedStep
 from dreamer_racing.learners.learner import Timer, untimed
-from dreamer_racing.learners.update import WorldModelLearner
+from dreamer_racing.learners.update import WorldModelLearner, fill_given
 from dreamer_racing.losses import (
     DreamerV3Losses,
     Trajectory,
@@ -99,8 +99,10 @@ class DreamerV3(WorldModelLearner):
 
         with timed("imagine"):
             # Imagination: starting from latents of the records, the policy acts H times in the world model.
-            number = self.config.imagination_starts
-            starts = choose_starts(latents.belief, latents.state, batch["terminated"], batch["previous_action"], number)
+            num_starts = self.config.imagination_starts
+            starts = choose_starts(
+                latents.belief, latents.state, batch["terminated"], batch["previous_action"], num_starts
+            )
             with gradient_of_actions(self.objective, model, critic):
                 imagined, action = imagine(model.rssm, actor, starts.belief, starts.state, self.horizon)
 
@@ -141,7 +143,7 @@ class DreamerV3(WorldModelLearner):
             # Critic: two-hot regression on the λ-returns of replayed and of imagined steps (Eq. 10). If every record
             # was a start, replayed returns bootstrap from its imagined return, which is better than the critic's value.
             shape = batch["terminated"].shape
-            bootstrap = returns[0].detach().reshape(shape) if number is None else None
+            bootstrap = returns[0].detach().reshape(shape) if num_starts is None else None
             losses |= self.replay_critic_losses(latents, batch, bootstrap)
             regression, logits = critic_loss(critic, features, returns.detach(), numbers.slow_critic_scale)
             losses["loss_critic"] = (weight * regression).mean()
@@ -174,9 +176,7 @@ class DreamerV3(WorldModelLearner):
             numbers: Arguments of `WorldModelLearner.adjust`.
         """
         super().adjust(**numbers)
-        for number, value in ((self.action_change_scale, action_change_scale), (self.crash_weight, crash_weight)):
-            if value is not None:
-                number.fill_(value)
+        fill_given((self.action_change_scale, action_change_scale), (self.crash_weight, crash_weight))
         if imagination_horizon is not None and round(imagination_horizon) != self.horizon:
             self.horizon = round(imagination_horizon)
             if self._graph is not None:

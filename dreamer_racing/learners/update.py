@@ -319,9 +319,7 @@ class WorldModelLearner(ABC):
             shares = (world_model_rate, 1.0)
             for group, rate, share in zip(self.optimizer.param_groups, self._rates, shares, strict=True):
                 group["lr"] = rate * rates * share
-        for number, value in ((self.discount, discount), (self.entropy_scale, entropy_scale)):
-            if value is not None:
-                number.fill_(value)
+        fill_given((self.discount, discount), (self.entropy_scale, entropy_scale))
         for name, bound in (("min_std", min_std), ("max_std", max_std)):
             if bound is not None:
                 for agent in (self.agent, self.evaluation_agent):
@@ -416,3 +414,10 @@ class WorldModelLearner(ABC):
         """Keep the latents of a batch's records, to refresh those in the replay buffer."""
         shape = latents.belief.shape[:2]
         self.latents = TensorDict({"belief": latents.belief.detach(), "state": latents.state.detach()}, shape)
+
+
+def fill_given(*numbers: tuple[Tensor, float | None]) -> None:
+    """Set scalar tensors, which a captured CUDA graph reads, to the values beside them, if these are not None."""
+    for number, value in numbers:
+        if value is not None:
+            number.fill_(value)

@@ -110,8 +110,8 @@ class DreamerV3Losses(LossConfig):
         action_change_scale: Weight of the squared change of the policy's mean from one imagined step to the next
             (`Trajectory.action_change`) in the actor's loss; the reference has none.
         crash_weight: Power of the predicted probability that an imagined episode continues: a small risk of a crash
-            counts this many times, and the actor flies with more caution. Values are then below
-            the expected returns. The reference has 1.
+            counts this many times, and the actor flies with more caution. Values are then below the
+            expected returns. The reference has 1.
         actor_begin: Number of updates before the actor starts to learn. The gradient through the dynamics is misleading
             while the model is wrong: an actor that starts with the model soon saturates. The reference has 0.
     """

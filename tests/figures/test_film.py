@@ -57,7 +57,7 @@ def flight(steps: int = 10) -> Trajectory:
 def test_video_reads_back(tmp_path, size, scale, expected):
     path = tmp_path / "new" / "video.mp4"
     frames = blocks(12, *size)
-    assert film.write_video(path, film.enlarge(frames, scale) if scale else film.enlarge_to_watch(frames), fps=50)
+    assert film.write_video(path, frames, fps=50, scale=scale)
     read = iio.imread(path, plugin="FFMPEG")
     assert read.shape == (12, *expected, 3)
     metadata = iio.immeta(path, plugin="FFMPEG")
