@@ -10,7 +10,7 @@ from gymnasium.wrappers.vector import RecordEpisodeStatistics
 from torch import nn
 from torch.distributions import Normal
 
-from dreamer_racing.modules.clipped_normal import clipped_mean
+from dreamer_racing.modules.heads import clipped_mean
 
 parser = argparse.ArgumentParser()
 parser.add_argument("--env-steps", type=int, default=1_500_000)

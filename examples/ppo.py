@@ -15,7 +15,7 @@ from torchrl.objectives.value import GAE
 
 from dreamer_racing.envs import DroneRacingEnv
 from dreamer_racing.evaluation.evaluate import evaluate
-from dreamer_racing.modules.clipped_normal import clipped_mean
+from dreamer_racing.modules.heads import clipped_mean
 
 parser = argparse.ArgumentParser()
 parser.add_argument("--env-steps", type=int, default=1_500_000)

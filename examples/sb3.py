@@ -11,7 +11,7 @@ from stable_baselines3.common.evaluation import evaluate_policy
 from stable_baselines3.common.vec_env import VecMonitor, VecNormalize
 
 from dreamer_racing.envs.sb3_env import DroneRaceVecEnv
-from dreamer_racing.modules.clipped_normal import clipped_mean
+from dreamer_racing.modules.heads import clipped_mean
 
 POLICIES = {"vector": "MlpPolicy", "pixels": "CnnPolicy", "state": "MultiInputPolicy", "both": "MultiInputPolicy"}
 

@@ -53,23 +53,6 @@ class NonFiniteLossError(RuntimeError):
         return f"The batch is saved in {path}"
 
 
-class Flag:
-    """A boolean scalar that is copied from the device asynchronously; reading it does not wait for later kernels."""
-
-    def __init__(self, value: Tensor) -> None:
-        self._value = value.to("cpu", non_blocking=True)
-        self._arrived: torch.cuda.Event | None = None
-        if value.is_cuda:
-            self._arrived = torch.cuda.Event()
-            self._arrived.record(torch.cuda.current_stream(value.device))
-
-    def __bool__(self) -> bool:
-        """Wait for the copy, and return the value."""
-        if self._arrived is not None:
-            self._arrived.synchronize()
-        return bool(self._value)
-
-
 class FiniteGuard:
     """Raises ``NonFiniteLossError`` if the metrics of an update are not finite.
 
@@ -79,7 +62,7 @@ class FiniteGuard:
 
     def __init__(self, lag: int) -> None:
         self._lag = lag
-        self._pending: deque[tuple[Flag, TensorDictBase, str]] = deque()
+        self._pending: deque[tuple[Tensor, torch.cuda.Event | None, TensorDictBase, str]] = deque()
 
     def check(self, metrics: dict[str, Tensor], batch: TensorDictBase, of: str = "") -> None:
         """Queue the metrics of an update; raise ``NonFiniteLossError`` if those of ``lag`` updates ago are not finite.
@@ -92,21 +75,26 @@ class FiniteGuard:
             for name, value in metrics.items()
             if name in ("loss", "reward_error") or name.startswith("gradient_norm/")
         ]
-        self._pending.append((Flag(torch.stack(watched).isfinite().all()), batch, of))
+        finite, copied = torch.stack(watched).isfinite().all(), None
+        if finite.is_cuda:  # copied asynchronously, so that reading it does not wait for later kernels
+            stream, copied = torch.cuda.current_stream(finite.device), torch.cuda.Event()
+            finite = finite.to("cpu", non_blocking=True)
+            copied.record(stream)
+        self._pending.append((finite, copied, batch, of))
         self.settle(self._lag)
 
     def settle(self, lag: int = 0) -> None:
         """Check all pending updates but the latest ``lag``; raise ``NonFiniteLossError`` for the first bad one."""
         while len(self._pending) > lag:
-            finite, batch, of = self._pending.popleft()
+            finite, copied, batch, of = self._pending.popleft()
+            if copied is not None:
+                copied.synchronize()
             if not finite:
                 raise NonFiniteLossError(batch, of)
 
 
 Step = Callable[[TensorDictBase], dict[str, Tensor]]
 """Function that computes the losses of a batch ``[B, T]`` and their gradients, and returns scalars by name."""
-
-
 WARMUPS = 3
 """Calls of a step before its capture, in which libraries allocate memory and choose kernels."""
 

@@ -16,11 +16,10 @@ from torchrl.modules import IndependentNormal
 from torchrl.objectives import ClipPPOLoss
 from torchrl.objectives.value.functional import vec_generalized_advantage_estimate
 
-from dreamer_racing.learners.baseline import BaselineLearner
+from dreamer_racing.learners.baseline import BaselineLearner, NetworkModule, NetworkSize, ObservationNetwork, make_actor
 from dreamer_racing.learners.learner import Timer, ValueFunction, seeded, untimed
-from dreamer_racing.learners.networks import NetworkModule, NetworkSize, ObservationNetwork, make_actor
 from dreamer_racing.modules import Interface
-from dreamer_racing.modules.clipped_normal import clipped_mean
+from dreamer_racing.modules.heads import clipped_mean
 from dreamer_racing.settings import COUNT, NOT_NEGATIVE, POSITIVE, SHARE, setting
 
 

@@ -14,9 +14,8 @@ from torch import Tensor, nn
 from torchrl.modules import TanhNormal
 from torchrl.objectives import SACLoss, SoftUpdate
 
-from dreamer_racing.learners.baseline import BaselineLearner
+from dreamer_racing.learners.baseline import BaselineLearner, NetworkModule, NetworkSize, ObservationNetwork, make_actor
 from dreamer_racing.learners.learner import Timer, seeded, untimed
-from dreamer_racing.learners.networks import NetworkModule, NetworkSize, ObservationNetwork, make_actor
 from dreamer_racing.modules import Interface
 from dreamer_racing.settings import COUNT, POSITIVE, SHARE, setting
 

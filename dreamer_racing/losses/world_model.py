@@ -17,12 +17,11 @@ from tensordict.utils import NestedKey
 from torch import Tensor, nn
 
 from dreamer_racing.losses.config import LossConfig
-from dreamer_racing.modules.agent import Agent
+from dreamer_racing.modules.agent import Agent, WorldModel
 from dreamer_racing.modules.autoencoder import VectorDecoder
 from dreamer_racing.modules.interface import PIXELS, PRIVILEGED
 from dreamer_racing.modules.layers import autocast, linear
 from dreamer_racing.modules.rssm import CONTEXT, Posterior, join_features, mix_uniform
-from dreamer_racing.modules.world_model import WorldModel
 from dreamer_racing.settings import import_own, suggestion
 
 OPEN_LOOP_STARTS = 64
@@ -94,7 +93,9 @@ class WorldModelLoss(nn.Module):
         Raises:
             KeyError: If the batch lacks a key.
         """
-        require_keys(batch, self.in_keys)
+        if missing := [key for key in self.in_keys if batch.get(key, None) is None]:
+            found = ", ".join(sorted(map(str, batch.keys())))
+            raise KeyError(f"The losses need {missing}, which the batch lacks. It has: {found}.")
         model, rssm, stored = self.world_model, self.world_model.rssm, batch.get(CONTEXT, None)
 
         # Infer the latents of the records, starting from those stored with each window's first record, if any.
@@ -196,14 +197,6 @@ def kl_losses(
         representation.sum(-1).clamp_min(free_nats),
         dynamics.detach().sum(-1),
     )
-
-
-def require_keys(batch: TensorDictBase, keys: list[NestedKey]) -> None:
-    """Raise ``KeyError``, which lists the missing and the existing keys of a batch, if one of ``keys`` is missing."""
-    missing = [key for key in keys if batch.get(key, None) is None]
-    if missing:
-        found = sorted(map(str, batch.keys()))
-        raise KeyError(f"The losses need {missing}, which the batch lacks. It has: {', '.join(found)}.")
 
 
 class Target(nn.Module):

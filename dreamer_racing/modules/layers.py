@@ -1,8 +1,13 @@
-"""Building blocks of all networks: initialisation, normalisation, linear layers, and weight gradients of time loops.
+"""Building blocks of all networks: initialisation, normalisation, linear layers, and what makes time loops cheaper.
 
 Ordinary backpropagation through T steps adds T products of thin matrices to a gradient as large as the weight, so
-memory traffic takes more time than arithmetic. Here each step of a time loop only stores its input and the gradient of
-its output, and one matrix product after the loop computes the weight's gradient.
+memory traffic takes more time than arithmetic. Here (`unrolled`) each step of a time loop only stores its input and the
+gradient of its output, and one matrix product after the loop computes the weight's gradient.
+
+On a CUDA device the launch of a kernel takes some microseconds, however little it computes, and autocast casts a weight
+at every use: imagination alone launches one cast for every weight in each step. `cast_once` casts all weights with one
+kernel, and their gradients back with another. The learner turns it and the modules' ``few_kernels`` on
+(`LearnerConfig.few_kernels`); they compute the same with different rounding, and gain nothing on a CPU.
 
 Shape legend: N any batch (in a loop, that of one step), I input features, O output features, G blocks.
 """
@@ -303,9 +308,8 @@ class DeferredWeight:
 
     def product(self, inputs: Tensor, base: Tensor | None = None) -> Tensor:
         """Map ``(..., N, I)`` to ``(..., N, O)``, plus the bias or a given base ``(N, O)``."""
-        if base is not None:
-            return _Sum.apply(base.to(self._dtype), inputs.to(self._dtype), self._weight, self._tape)
-        return _Product.apply(inputs.to(self._dtype), self._weight, self._bias, self._tape)
+        base = None if base is None else base.to(self._dtype)
+        return _Product.apply(inputs.to(self._dtype), self._weight, self._bias, base, self._tape)
 
 
 def autocast_type(device_type: str) -> torch.dtype | None:
@@ -336,34 +340,68 @@ class _Collect(Function):
 
 
 class _Product(Function):
-    """Product of one step."""
+    """Product of one step, plus the bias, whose gradient `_Collect` computes, or a base, whose gradient goes on."""
 
     @staticmethod
-    def forward(ctx: FunctionCtx, inputs: Tensor, weight: Tensor, bias: Tensor | None, tape: Tape) -> Tensor:
+    def forward(
+        ctx: FunctionCtx, inputs: Tensor, weight: Tensor, bias: Tensor | None, base: Tensor | None, tape: Tape
+    ) -> Tensor:
         ctx.save_for_backward(inputs, weight)
         ctx.tape = tape  # type: ignore[attr-defined]  # torch lets a context hold anything
-        if bias is None:
+        added = bias if base is None else base
+        if added is None:
             return inputs @ weight
-        return (torch.addmm if weight.ndim == 2 else torch.baddbmm)(bias, inputs, weight)
+        return (torch.addmm if weight.ndim == 2 else torch.baddbmm)(added, inputs, weight)
 
     @staticmethod
     def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor | None, ...]:
         inputs, weight = ctx.saved_tensors
         ctx.tape.add(inputs, gradient)
-        return gradient @ weight.mT if ctx.needs_input_grad[0] else None, None, None, None
+        of_inputs = gradient @ weight.mT if ctx.needs_input_grad[0] else None
+        return of_inputs, None, None, gradient if ctx.needs_input_grad[3] else None, None
 
 
-class _Sum(Function):
-    """Product of one step, added to a base."""
+LAYERS = (nn.Linear, nn.Conv2d, nn.ConvTranspose2d, BlockLinear, LayerNorm, RMSNorm)
+"""Layers whose weights, biases and gains are cast; all other parameters stay in float32."""
+
+
+def use_few_kernels(module: nn.Module) -> None:
+    """Turn on ``few_kernels`` in all submodules that have it."""
+    for part in module.modules():
+        if hasattr(part, "few_kernels"):
+            part.few_kernels = True  # type: ignore[assignment]  # no tensor, nor a module
+
+
+@contextmanager
+def cast_once(module: nn.Module, dtype: torch.dtype) -> Iterator[None]:
+    """Make the layers of a module use casted copies of their parameters; gradients flow to the originals.
+
+    Autocast then only has to cast activations. If a parameter is used several times, its gradients are summed in the
+    type of the copies.
+    """
+    layers = {layer: None for layer in module.modules() if isinstance(layer, LAYERS)}
+    held = [(layer, name, p) for layer in layers for name, p in layer._parameters.items() if p is not None]
+    with replaced(held, _Cast.apply(dtype, *(parameter for _, _, parameter in held))):
+        yield
+
+
+class _Cast(Function):
+    """Casts many tensors with one kernel."""
 
     @staticmethod
-    def forward(ctx: FunctionCtx, base: Tensor, inputs: Tensor, weight: Tensor, tape: Tape) -> Tensor:
-        ctx.save_for_backward(inputs, weight)
-        ctx.tape = tape  # type: ignore[attr-defined]  # torch lets a context hold anything
-        return torch.addmm(base, inputs, weight)
+    def forward(ctx: FunctionCtx, dtype: torch.dtype, *tensors: Tensor) -> tuple[Tensor, ...]:
+        ctx.set_materialize_grads(False)
+        return tuple(_cast(tensors, dtype))
 
     @staticmethod
-    def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor | None, ...]:
-        inputs, weight = ctx.saved_tensors
-        ctx.tape.add(inputs, gradient)
-        return gradient, gradient @ weight.mT if ctx.needs_input_grad[1] else None, None, None
+    def backward(ctx: Any, *gradients: Tensor | None) -> tuple[Tensor | None, ...]:
+        there = [gradient for gradient in gradients if gradient is not None]
+        cast = iter(_cast(there, torch.float32))
+        return None, *(None if gradient is None else next(cast) for gradient in gradients)
+
+
+def _cast(tensors: Sequence[Tensor], dtype: torch.dtype) -> list[Tensor]:
+    copies = [torch.empty_like(tensor, dtype=dtype) for tensor in tensors]
+    if copies:
+        torch._foreach_copy_(copies, list(tensors))
+    return copies

@@ -17,8 +17,8 @@ from torchrl.objectives.value import GAE
 
 from dreamer_racing.experience.replay import make_replay
 from dreamer_racing.learners import NetworkSize, PPOConfig, PPOLearner, SACConfig, SACLearner
+from dreamer_racing.learners.baseline import ImageTrunk, ObservationNetwork
 from dreamer_racing.learners.gradient_step import NonFiniteLossError
-from dreamer_racing.learners.networks import ImageTrunk, ObservationNetwork
 from dreamer_racing.modules import Interface
 
 SMALL, NUMBERS = NetworkSize(2, 16), Interface(action_dim=1, pixels=False, vector_dim=1)

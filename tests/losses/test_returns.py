@@ -10,8 +10,14 @@ from tensordict import TensorDict
 from torchrl.objectives.dreamer_v3 import _replay_value_target
 from torchrl.objectives.value.functional import td_lambda_return_estimate
 
-from dreamer_racing.losses import critic_loss, lambda_return, replay_critic_loss, replay_return, rollout_return
-from dreamer_racing.losses.imagination import choose_starts
+from dreamer_racing.losses import (
+    choose_starts,
+    critic_loss,
+    lambda_return,
+    replay_critic_loss,
+    replay_return,
+    rollout_return,
+)
 from dreamer_racing.modules import Critic
 
 

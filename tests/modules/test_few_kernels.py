@@ -9,10 +9,9 @@ import torch
 from torch import Tensor, nn
 
 from dreamer_racing.learners.dreamer_v3 import DreamerV3
-from dreamer_racing.losses.imagination import Imagination, imagine
-from dreamer_racing.modules import ModelSize, few_kernels, get_size
-from dreamer_racing.modules.few_kernels import cast_once
-from dreamer_racing.modules.layers import BlockLinear, LayerNorm, RMSNorm, autocast, linear, unrolled
+from dreamer_racing.losses import Imagination, imagine
+from dreamer_racing.modules import ModelSize, get_size, layers
+from dreamer_racing.modules.layers import BlockLinear, LayerNorm, RMSNorm, autocast, cast_once, linear, unrolled
 from dreamer_racing.modules.recurrent_cells import GatedUpdate, gate_shift, gated_update
 from tests.dreamers import imagine_from, latent_ppo_of, learner_of
 from tests.launches import launches
@@ -73,7 +72,7 @@ def test_gradients_are_the_same_in_bfloat16_but_for_its_rounding(
     of it is rounding, in a network so small. Gains of layer norms stay in float32, because a CPU, unlike CUDA, would
     keep the statistics in the type of the gains.
     """
-    monkeypatch.setattr(few_kernels, "LAYERS", tuple(kind for kind in few_kernels.LAYERS if kind is not LayerNorm))
+    monkeypatch.setattr(layers, "LAYERS", tuple(kind for kind in layers.LAYERS if kind is not LayerNorm))
     exact = gradients(make_pair(SIZES[size], world_model=world_model)[0])
     plain, few = (gradients(of) for of in make_pair(SIZES[size], world_model=world_model, mixed_precision=True))
     assert all(value.dtype == torch.float32 for value in few.values())

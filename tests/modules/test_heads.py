@@ -10,7 +10,6 @@ from torch.distributions import Independent, Normal
 from torchrl.modules import SymExpTwoHot
 from torchrl.objectives.dreamer_v3 import two_hot_cross_entropy
 
-from dreamer_racing.modules.clipped_normal import clipped_mean
 from dreamer_racing.modules.heads import (
     FIRST_STD,
     MLP,
@@ -19,6 +18,7 @@ from dreamer_racing.modules.heads import (
     ContinueHead,
     Critic,
     TwoHot,
+    clipped_mean,
     symexp,
     symlog,
 )

@@ -13,7 +13,7 @@ from torchrl.envs import EnvBase, InitTracker, TransformedEnv
 
 from dreamer_racing.envs import DroneRacingEnv
 from dreamer_racing.envs.simulator.scene import Camera
-from dreamer_racing.learners.networks import NetworkSize, ObservationNetwork, check_layers, layers_of
+from dreamer_racing.learners.baseline import NetworkSize, ObservationNetwork, check_layers, layers_of
 from dreamer_racing.modules import (
     SIZES,
     DreamerPolicy,
@@ -22,12 +22,12 @@ from dreamer_racing.modules import (
     ObservationEncoder,
     VectorDecoder,
     VectorEncoder,
+    WorldModel,
     get_size,
 )
 from dreamer_racing.modules.agent import Agent
 from dreamer_racing.modules.heads import symlog
 from dreamer_racing.modules.interface import IMU, PIXELS, PRIVILEGED
-from dreamer_racing.modules.world_model import WorldModel
 
 
 class SpecEnv(EnvBase):

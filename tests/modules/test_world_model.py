@@ -7,7 +7,7 @@ from dataclasses import replace
 import pytest
 import torch
 
-from dreamer_racing.modules import SIZES
+from dreamer_racing.modules import SIZES, WorldModel
 from dreamer_racing.modules.autoencoder import (
     ImageDecoder,
     ImageEncoder,
@@ -17,7 +17,6 @@ from dreamer_racing.modules.autoencoder import (
     unfold_patches,
 )
 from dreamer_racing.modules.layers import autocast
-from dreamer_racing.modules.world_model import WorldModel
 
 
 def make_records(batch: int = 2, time: int = 5) -> tuple[dict[str, torch.Tensor], torch.Tensor, torch.Tensor]:
