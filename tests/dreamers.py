@@ -42,6 +42,13 @@ def learner_of(
 latent_ppo_of = functools.partial(learner_of, kind=LatentPPO)
 
 
+def learner_by(actor: str, *size_and_interface: Any, horizon: int = 3, **numbers: Any) -> Any:
+    """A learner whose actor imagines, or that of ``latent_ppo``."""
+    if actor == "latent_ppo":
+        return latent_ppo_of(*size_and_interface, seed=0, **numbers)
+    return learner_of(*size_and_interface, seed=0, horizon=horizon, actor=actor, **numbers)
+
+
 def make_windows(
     batch: int,
     time: int,

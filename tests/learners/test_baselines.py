@@ -50,11 +50,9 @@ def random_rollout(num_envs: int = 4, steps: int = 12) -> TensorDict:
     generator = torch.Generator().manual_seed(0)
     ends = torch.rand(2, num_envs, steps, generator=generator) < 0.15
     terminated, truncated = ends[0], ends[1] & ~ends[0]
-    vector = torch.randn(num_envs, steps, generator=generator)
-    following = torch.randn(num_envs, steps, generator=generator)
+    vector, following, reward = torch.randn(3, num_envs, steps, generator=generator)
     goes_on = ~(terminated | truncated)[:, :-1]
     following[:, :-1][goes_on] = vector[:, 1:][goes_on]
-    reward = torch.randn(num_envs, steps, generator=generator)
     return make_rollout(vector, following, reward, terminated, truncated)
 
 
@@ -68,25 +66,17 @@ class Echo(nn.Module):
 def test_advantages_by_hand() -> None:
     learner = PPOLearner(SMALL, NUMBERS, PPOConfig(discount=0.5, lambda_=0.5, reward_scale=2.0), seed=0)
     learner.critic = TensorDictModule(Echo(), ["vector"], ["state_value"])
-    no = torch.tensor([[False, False, False, False]])
-    terminated, truncated = no.clone(), no.clone()
-    terminated[0, 1], truncated[0, 2] = True, True
-    rollout = make_rollout(
-        torch.tensor([[1.0, 2.0, 3.0, 4.0]]),
-        torch.tensor([[2.0, 9.0, 8.0, 6.0]]),
-        torch.tensor([[1.0, 1.0, 1.0, 1.0]]),
-        terminated,
-        truncated,
-    )
-    records = learner.with_advantages(rollout)
+    vector, following = torch.tensor([[1.0, 2.0, 3.0, 4.0]]), torch.tensor([[2.0, 9.0, 8.0, 6.0]])
+    terminated, truncated = (torch.arange(4).unsqueeze(0) == step for step in (1, 2))
+    records = learner.with_advantages(make_rollout(vector, following, torch.ones(1, 4), terminated, truncated))
     # 2 r + γ V(next) − V: the last two bootstrap from what came next, the second from nothing.
     last = 2 + 0.5 * 6 - 4
     cut = 2 + 0.5 * 8 - 3
     crash = 2 - 2
     first = 2 + 0.5 * 2 - 1 + 0.25 * crash
-    torch.testing.assert_close(records["advantage"].flatten(), torch.tensor([first, crash, cut, last]).float())
-    value_target = torch.tensor([first + 1, crash + 2, cut + 3, last + 4]).float()
-    torch.testing.assert_close(records["value_target"].flatten(), value_target)
+    advantage = torch.tensor([first, crash, cut, last]).float()
+    torch.testing.assert_close(records["advantage"].flatten(), advantage)
+    torch.testing.assert_close(records["value_target"].flatten(), advantage + vector.flatten())
 
 
 def test_advantages_equal_torchrls() -> None:
@@ -133,13 +123,18 @@ def test_networks_of_another_size_are_refused(kind: type[PPOLearner | SACLearner
         kind(SMALL, NUMBERS, seed=0).load_state_dict(saved)
 
 
-def test_networks_for_other_images_are_refused() -> None:
-    learner = PPOLearner(SMALL, Interface(image_size=64), seed=0)
-    with pytest.raises(ValueError, match=r"env.image_size=96, this learner's with 64"):
-        learner.load_state_dict(PPOLearner(SMALL, Interface(image_size=96), seed=0).state_dict())
-    of_numbers = Interface(pixels=False, vector_dim=21)
-    with pytest.raises(ValueError, match=r"env.from_pixels=false, this learner's with true: set env.from_pixels=false"):
-        learner.load_state_dict(PPOLearner(SMALL, of_numbers, seed=0).state_dict())
+@pytest.mark.parametrize(
+    ("there", "words"),
+    [
+        (Interface(image_size=96), "env.image_size=96, this learner's with 64"),
+        (Interface(pixels=False, vector_dim=21), "env.from_pixels=false, .* with true: set env.from_pixels=false"),
+    ],
+    ids=["size", "none"],
+)
+def test_networks_for_other_images_are_refused(there: Interface, words: str) -> None:
+    saved = PPOLearner(SMALL, there, seed=0).state_dict()
+    with pytest.raises(ValueError, match=words):
+        PPOLearner(SMALL, Interface(image_size=64), seed=0).load_state_dict(saved)
 
 
 @pytest.mark.parametrize(("minibatches", "steps"), [(1, 1), (7, 7), (48, 48)])

@@ -25,7 +25,7 @@ from dreamer_racing.learners.dreamer_v3 import DreamerV3
 from dreamer_racing.learners.update import WorldModelLearner
 from dreamer_racing.losses import TARGETS, Trajectory
 from dreamer_racing.modules import Interface, get_size
-from tests.dreamers import latent_ppo_of, learner_of, make_windows
+from tests.dreamers import learner_by, learner_of, make_windows
 from tests.launches import Launches, launches
 
 
@@ -153,11 +153,9 @@ LOSSES = [*product(TARGETS, ACTORS[:1]), *product([next(iter(TARGETS))], ACTORS[
 """Every target and every actor; neither knows of the other."""
 
 
-def make_learner(actor: str, **options: Any) -> WorldModelLearner:
-    """With an actor that imagines, or by `latent_ppo`."""
-    if actor == "latent_ppo":
-        return latent_ppo_of("debug", INTERFACE, seed=0, critic="state", **options)
-    return learner_of("debug", INTERFACE, seed=0, horizon=3, actor=actor, **options)
+def make_learner(actor: str, size: str = "debug", **options: Any) -> WorldModelLearner:
+    of_state = {"critic": "state"} if actor == "latent_ppo" else {}
+    return learner_by(actor, SIZES[size], INTERFACE, **of_state, **options)
 
 
 def test_kernels_waits_and_devices_are_told_apart() -> None:
@@ -185,8 +183,7 @@ def test_no_update_waits_for_the_device(
     monkeypatch: pytest.MonkeyPatch, world_model: str, actor: str, mixed_precision: bool
 ) -> None:
     monkeypatch.setattr(latent_ppo, "masks_steps", lambda device: True)
-    kinds = {"world_model": world_model, "drift_scale": 1.0, "mixed_precision": mixed_precision}
-    learner = make_learner(actor, **kinds)
+    learner = make_learner(actor, world_model=world_model, drift_scale=1.0, mixed_precision=mixed_precision)
     batch = with_context(records(), learner)
     learner.update(batch)  # optimisers make their moments
     seen = launches(captured(learner, batch))
@@ -200,25 +197,21 @@ def test_no_update_waits_for_the_device(
 @pytest.mark.parametrize("size", SIZES)
 @pytest.mark.parametrize("options", [{}, {"imagination_starts": 5}], ids=["all", "some"])
 def test_no_size_waits_for_the_device(size: str, options: dict[str, object]) -> None:
-    learner = learner_of(SIZES[size], INTERFACE, seed=0, horizon=3, mixed_precision=True, average_rate=0.1, **options)
+    learner = make_learner("reinforce", size, mixed_precision=True, average_rate=0.1, **options)
     seen = launches(captured(learner, with_context(records(), learner)))
     assert seen.count > 100 and (waits(seen), seen.mixed) == ([], [])
 
 
-@pytest.mark.parametrize(("world_model", "actor"), LOSSES)
-def test_no_update_makes_tensors_on_another_device(world_model: str, actor: str) -> None:
+@pytest.mark.parametrize(
+    ("world_model", "actor", "size"),
+    [*((*loss, "debug") for loss in LOSSES), *(("reconstruction", "reinforce", size) for size in [*SIZES][1:])],
+)
+def test_no_update_makes_tensors_on_another_device(world_model: str, actor: str, size: str) -> None:
     """On the meta device, which holds nothing: what is on the CPU beside it would be beside CUDA, too."""
     with torch.device("cpu"):  # the default of what forgets to say where
-        learner = make_learner(actor, world_model=world_model, drift_scale=1.0, device="meta")
+        learner = make_learner(actor, size, world_model=world_model, drift_scale=1.0, device="meta")
         batch = with_context(records("meta"), learner)
         seen = launches(captured(learner, batch))
-    assert seen.count > 100 and seen.mixed == []
-
-
-@pytest.mark.parametrize("size", SIZES)
-def test_no_size_makes_tensors_on_another_device(size: str) -> None:
-    learner = learner_of(SIZES[size], INTERFACE, device="meta", horizon=3)
-    seen = launches(captured(learner, with_context(records("meta"), learner)))
     assert seen.count > 100 and seen.mixed == []
 
 

@@ -7,6 +7,8 @@ computed twice, by independent code. Where TorchRL deviates from the reference t
 from __future__ import annotations
 
 import copy
+from collections.abc import Callable, Mapping
+from typing import Any
 
 import numpy as np
 import pytest
@@ -22,7 +24,7 @@ from torchrl.objectives import DreamerV3ActorLoss, DreamerV3Loss, DreamerV3Model
 from torchrl.objectives.utils import ValueEstimators
 
 from dreamer_racing.losses import LossConfig, WorldModelLoss, critic_loss, replay_critic_loss
-from dreamer_racing.modules import SIZES, Critic, Interface, TwoHotHead, WorldModel, join_features
+from dreamer_racing.modules import SIZES, Critic, Interface, WorldModel, join_features
 from dreamer_racing.modules.agent import Agent
 from tests.dreamers import imagine_from, learner_of, make_windows
 
@@ -88,27 +90,20 @@ class StockWorldModel(nn.Module):
         return tensordict
 
 
-class StockActor(nn.Module):
-    """Mean and standard deviation of our actor."""
+class OnFeatures(nn.Module):
+    """A function of a head and the features; TorchRL copies it, and swaps the head's parameters."""
 
-    def __init__(self, actor: nn.Module) -> None:
-        super().__init__()
-        self.actor = actor
-
-    def forward(self, belief: Tensor, state: Tensor) -> tuple[Tensor, Tensor]:
-        return tuple(self.actor(join_features(belief, state)))
-
-
-class StockValue(nn.Module):
-    """Logits and mean of a two-hot head."""
-
-    def __init__(self, head: TwoHotHead) -> None:
+    def __init__(self, head: nn.Module, function: Callable[[Any, Tensor], Any]) -> None:
         super().__init__()
         self.head = head
+        self.function = function
 
-    def forward(self, belief: Tensor, state: Tensor) -> tuple[Tensor, Tensor]:
-        features = join_features(belief, state)
-        return self.head(features), self.head.mean(features)
+    def forward(self, belief: Tensor, state: Tensor) -> Any:
+        return self.function(self.head, join_features(belief, state))
+
+
+def on_features(head: nn.Module, function: Callable[[Any, Tensor], Any], *out_keys: str) -> TensorDictModule:
+    return TensorDictModule(OnFeatures(head, function), in_keys=["belief", "state"], out_keys=[*out_keys])
 
 
 class StockContinuation(TensorDictModule):
@@ -136,14 +131,6 @@ class StockContinuation(TensorDictModule):
 def stock_environment(world_model: WorldModel) -> DreamerEnv:
     """Our dynamics and reward head as TorchRL's imagination environment."""
 
-    class Reward(nn.Module):
-        def __init__(self) -> None:
-            super().__init__()
-            self.head = world_model.reward_head
-
-        def forward(self, belief: Tensor, state: Tensor) -> Tensor:
-            return self.head.mean(join_features(belief, state))
-
     class Transition(nn.Module):
         def __init__(self) -> None:
             super().__init__()
@@ -157,7 +144,7 @@ def stock_environment(world_model: WorldModel) -> DreamerEnv:
     environment = DreamerEnv(
         WorldModelWrapper(
             TensorDictModule(Transition(), in_keys=["belief", "state", "action"], out_keys=["belief", "state"]),
-            TensorDictModule(Reward(), in_keys=["belief", "state"], out_keys=["reward"]),
+            on_features(world_model.reward_head, lambda head, features: head.mean(features), "reward"),
         ),
         prior_shape=(SIZE.state,),
         belief_shape=(SIZE.belief,),
@@ -177,14 +164,14 @@ def stock_model_loss(world_model: WorldModel, **options) -> DreamerV3ModelLoss:
 
 
 def stock_value(critic: Critic) -> TensorDictModule:
-    return TensorDictModule(
-        StockValue(critic.head), in_keys=["belief", "state"], out_keys=["state_value_logits", "state_value"]
+    return on_features(
+        critic.head, lambda head, features: (head(features), head.mean(features)), "state_value_logits", "state_value"
     )
 
 
 def stock_actor_loss(agent: Agent, terminated: Tensor | None = None, **options) -> DreamerV3ActorLoss:
     actor = ProbabilisticTensorDictSequential(
-        TensorDictModule(StockActor(agent.actor), in_keys=["belief", "state"], out_keys=["loc", "scale"]),
+        on_features(agent.actor, lambda actor, features: tuple(actor(features)), "loc", "scale"),
         ProbabilisticTensorDictModule(
             in_keys=["loc", "scale"],
             out_keys=["action"],
@@ -222,6 +209,30 @@ def assert_same_gradients(ours: nn.Module, stock: nn.Module, rtol: float = 1e-4)
         torch.testing.assert_close(value, expected[name], rtol=rtol, atol=rtol * expected[name].abs().max().item())
 
 
+PAIRS = {
+    "loss_image": "loss_model_reco",
+    "loss_reward": "loss_model_reward",
+    "loss_continue": "loss_model_continue",
+    "loss_dynamics": "loss_model_dynamic",
+    "loss_representation": "loss_model_representation",
+}
+"""Our losses of the world model, and TorchRL's."""
+
+
+def assert_same_losses(ours: Mapping[str, Tensor], stock: TensorDict, pairs: Mapping[str, str]) -> None:
+    """Compare losses, and make the gradients of their sums."""
+    for key, stock_key in pairs.items():
+        torch.testing.assert_close(ours[key], stock[stock_key].squeeze(), **TOLERANCE)
+    sum(ours[key] for key in pairs).backward()
+    sum(stock[key] for key in pairs.values()).backward()
+
+
+def assert_same_critic_gradients(critic: Critic, oracle: DreamerV3ValueLoss) -> None:
+    found = gradients(oracle.value_model_params)
+    for name, gradient in gradients(critic.head).items():
+        torch.testing.assert_close(gradient, found[f"module.head.{name}"], rtol=1e-4, atol=1e-6)
+
+
 @pytest.mark.parametrize("free_nats", [0.0, 1.0])
 def test_world_model_loss(free_nats):
     agent, batch = make_agent(), make_batch(crashes=True)
@@ -230,19 +241,9 @@ def test_world_model_loss(free_nats):
     losses, latents = WorldModelLoss(agent, LossConfig(free_nats=free_nats))(batch)
     torch.manual_seed(2)
     expected, posterior = stock_model_loss(stock, free_bits=free_nats)(stock_batch(batch))
-    pairs = {
-        "loss_image": "loss_model_reco",
-        "loss_reward": "loss_model_reward",
-        "loss_continue": "loss_model_continue",
-        "loss_dynamics": "loss_model_dynamic",
-        "loss_representation": "loss_model_representation",
-    }
-    for key, stock_key in pairs.items():
-        torch.testing.assert_close(losses[key], expected[stock_key].squeeze(), **TOLERANCE)
+    assert_same_losses(losses, expected, PAIRS)
     torch.testing.assert_close(latents.belief, posterior["next", "belief"])
     assert losses["kl"] > 0.1
-    sum(losses[key] for key in pairs).backward()
-    sum(expected[key] for key in pairs.values()).backward()
     assert_same_gradients(ours, stock)
 
 
@@ -344,35 +345,31 @@ def test_critic_loss(slow_scale):
     torch.testing.assert_close(loss, expected["loss_value"], **TOLERANCE)
     loss.backward()
     expected["loss_value"].backward()
-    found = gradients(oracle.value_model_params)
-    for name, gradient in gradients(agent.critic.head).items():
-        torch.testing.assert_close(gradient, found[f"module.head.{name}"], rtol=1e-4, atol=1e-6)
+    assert_same_critic_gradients(agent.critic, oracle)
 
 
-def replayed(agent: Agent, inputs: TensorDict, batch: TensorDict) -> Tensor:
+def replay_losses(batch: TensorDict) -> tuple[Agent, TensorDict, DreamerV3ValueLoss, Tensor, Tensor]:
+    """Agent, latents, TorchRL's loss module, and our and its loss of replayed returns."""
+    agent = make_agent()
+    inputs = make_critic_input(batch)
     features = join_features(inputs["belief"], inputs["state"])
-    return replay_critic_loss(agent.critic, features, batch, torch.tensor(DISCOUNT), 0.95, 1.0, inputs["bootstrap"])
+    ours = replay_critic_loss(agent.critic, features, batch, torch.tensor(DISCOUNT), 0.95, 1.0, inputs["bootstrap"])
+    oracle = stock_value_loss(copy.deepcopy(agent.critic))
+    expected = oracle.replay_value_loss(stock_replay(inputs, batch), horizon=HORIZON, lmbda=0.95)["loss_replay_value"]
+    return agent, inputs, oracle, ours, expected
 
 
 def test_replay_critic_loss_without_crashes():
     """TorchRL and the reference average over the T − 1 records that have a next one, we over all T."""
-    agent, batch = make_agent(), make_batch()
-    inputs = make_critic_input(batch)
-    ours = replayed(agent, inputs, batch)
-    oracle = stock_value_loss(copy.deepcopy(agent.critic))
-    expected = oracle.replay_value_loss(stock_replay(inputs, batch), horizon=HORIZON, lmbda=0.95)["loss_replay_value"]
+    *_, ours, expected = replay_losses(make_batch())
     torch.testing.assert_close(7 * ours, 6 * expected, **TOLERANCE)
 
 
 def test_replay_critic_loss_with_crashes():
     """TorchRL leaves out records that end an episode; we teach the critic that a crash is worth zero from there on."""
-    agent, batch = make_agent(), make_batch(crashes=True)
-    inputs = make_critic_input(batch)
-    ours = replayed(agent, inputs, batch)
-    oracle = stock_value_loss(copy.deepcopy(agent.critic))
-    expected = oracle.replay_value_loss(stock_replay(inputs, batch), horizon=HORIZON, lmbda=0.95)["loss_replay_value"]
-    crashed = batch["terminated"].squeeze(-1)
-    features = join_features(inputs["belief"], inputs["state"])[crashed]
+    batch = make_batch(crashes=True)
+    agent, inputs, oracle, ours, expected = replay_losses(batch)
+    features = join_features(inputs["belief"], inputs["state"])[batch["terminated"].squeeze(-1)]
     log_probabilities = agent.critic(features).log_softmax(-1)
     slow_value = agent.critic.slow_value(features)
     targets = (oracle._step_value_loss(log_probabilities, target) for target in (torch.zeros(2), slow_value[..., 0]))
@@ -399,24 +396,14 @@ def test_whole_objective(actor_loss):
     losses = learner.compute_losses(batch)
     torch.manual_seed(6)
     expected = oracle(stock_batch(batch))
-    pairs = {
-        "loss_image": "loss_model_reco",
-        "loss_reward": "loss_model_reward",
-        "loss_continue": "loss_model_continue",
-        "loss_dynamics": "loss_model_dynamic",
-        "loss_representation": "loss_model_representation",
+    pairs = PAIRS | {
         "loss_actor": "loss_actor",
         "loss_critic": "loss_value",
         "loss_replay_critic": "loss_replay_value",
     }
     assert {key for key in losses if key.startswith("loss_")} == pairs.keys()
     assert {key for key in expected.keys() if key.startswith("loss_")} == set(pairs.values())  # noqa: SIM118
-    for key, stock_key in pairs.items():
-        torch.testing.assert_close(losses[key], expected[stock_key].squeeze(), **TOLERANCE)
-    sum(losses[key] for key in pairs).backward()
-    sum(expected[key] for key in pairs.values()).backward()
+    assert_same_losses(losses, expected, pairs)
     for name in ("world_model", "actor"):
         assert_same_gradients(getattr(learner.agent, name), getattr(stock, name))
-    found = gradients(oracle.value_loss.value_model_params)
-    for name, gradient in gradients(learner.agent.critic.head).items():
-        torch.testing.assert_close(gradient, found[f"module.head.{name}"], rtol=1e-4, atol=1e-6)
+    assert_same_critic_gradients(learner.agent.critic, oracle.value_loss)

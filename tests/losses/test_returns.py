@@ -49,38 +49,24 @@ def test_lambda_return_agrees_with_torchrl():
     torch.testing.assert_close(ours, oracle.transpose(0, 1))
 
 
-def test_replay_return_by_hand_within_an_episode():
-    returns, weight = replay_return(
-        numbers(9, 1, 2, 3), numbers(10, 20, 30, 40), NEVER, NEVER, NEVER, discount=0.5, lambda_=0.5
-    )
-    # G_3 = 40; G_2 = 3 + 0.5·40 = 23; G_1 = 2 + 0.5·(15 + 11.5) = 15.25; G_0 = 1 + 0.5·(10 + 7.625) = 9.8125
-    torch.testing.assert_close(returns, numbers(9.8125, 15.25, 23.0, 40.0))
-    assert torch.equal(weight, numbers(1, 1, 1, 0))
-
-
-def test_nothing_follows_a_terminated_record():
-    returns, weight = replay_return(
-        numbers(9, 1, 0, 3),
-        numbers(10, 20, 30, 40),
-        flags(0, 0, 1, 0),
-        flags(0, 1, 0, 0),
-        NEVER,
-        discount=0.5,
-        lambda_=0.5,
-    )
-    # Record 1 crashed: its return is 0 and record 0's is its reward alone. Record 2 begins anew.
-    torch.testing.assert_close(returns, numbers(1.0, 0.0, 23.0, 40.0))
-    assert torch.equal(weight, numbers(1, 1, 1, 0))
-
-
-@pytest.mark.parametrize("truncated", [flags(0, 1, 0, 0), NEVER])
-def test_a_truncated_record_bootstraps_from_its_own_value(truncated):
-    """Also where only the following ``is_init`` tells that the stream was cut."""
-    returns, weight = replay_return(
-        numbers(9, 1, 0, 3), numbers(10, 20, 30, 40), flags(0, 0, 1, 0), NEVER, truncated, discount=0.5, lambda_=0.5
-    )
-    torch.testing.assert_close(returns, numbers(1 + 0.5 * 20, 20.0, 23.0, 40.0))
-    assert torch.equal(weight, numbers(1, 0, 1, 0))
+@pytest.mark.parametrize(
+    ("is_init", "terminated", "truncated", "returns", "weight"),
+    [
+        # G_3 = 40; G_2 = 3 + 0.5·40 = 23; G_1 = 2 + 0.5·(15 + 11.5) = 15.25; G_0 = 1 + 0.5·(10 + 7.625) = 9.8125
+        (NEVER, NEVER, NEVER, (9.8125, 15.25, 23.0, 40.0), (1, 1, 1, 0)),
+        # Record 1 crashed: its return is 0 and record 0's is its reward alone. Record 2 begins anew.
+        (flags(0, 0, 1, 0), flags(0, 1, 0, 0), NEVER, (1.0, 0.0, 23.0, 40.0), (1, 1, 1, 0)),
+        # A truncated record bootstraps from its own value, also where only the following ``is_init`` tells of the cut.
+        (flags(0, 0, 1, 0), NEVER, flags(0, 1, 0, 0), (1 + 0.5 * 20, 20.0, 23.0, 40.0), (1, 0, 1, 0)),
+        (flags(0, 0, 1, 0), NEVER, NEVER, (1 + 0.5 * 20, 20.0, 23.0, 40.0), (1, 0, 1, 0)),
+    ],
+    ids=["within an episode", "crash", "truncation", "cut"],
+)
+def test_replay_return_by_hand(is_init, terminated, truncated, returns, weight):
+    ends = (is_init, terminated, truncated)
+    found, weights = replay_return(numbers(9, 1, 2, 3), numbers(10, 20, 30, 40), *ends, discount=0.5, lambda_=0.5)
+    torch.testing.assert_close(found, numbers(*returns))
+    assert torch.equal(weights, numbers(*weight))
 
 
 def test_replay_return_agrees_with_torchrl():
@@ -139,18 +125,18 @@ def test_a_new_critic_is_uniform():
 def test_a_bootstrap_stands_for_the_critic_s_own_values():
     """At a window's last record but one the return is the reward and what the last is said to be worth."""
     critic, batch, features = make_critic(), make_batch(), torch.randn(2, 6, 4)
-    losses = [
-        replay_critic_loss(critic, features, batch, torch.tensor(0.9), 0.95, 0.0, bootstrap)
-        for bootstrap in (None, torch.zeros(2, 6, 1))
-    ]
-    assert losses[0] == losses[1], "a new critic says zero"
+
+    def losses() -> list[float]:
+        own_and_zero = (None, torch.zeros(2, 6, 1))
+        numbers = (torch.tensor(0.9), 0.95, 0.0)
+        return [replay_critic_loss(critic, features, batch, *numbers, bootstrap).item() for bootstrap in own_and_zero]
+
+    own, zero = losses()
+    assert own == zero, "a new critic says zero"
     with torch.no_grad():
         critic.head.mlp.output.bias[130] = 5.0
-    apart = [
-        replay_critic_loss(critic, features, batch, torch.tensor(0.9), 0.95, 0.0, bootstrap)
-        for bootstrap in (None, torch.zeros(2, 6, 1))
-    ]
-    assert apart[0] != apart[1]
+    own, zero = losses()
+    assert own != zero
 
 
 def test_imagination_begins_from_all_latents_or_from_some_drawn():

@@ -14,11 +14,15 @@ import torch
 from tensordict import TensorDict
 from torchrl.objectives.dreamer_v3 import categorical_kl_terms
 
+from dreamer_racing.experience.replay import make_replay
 from dreamer_racing.losses import TARGETS, LossConfig, WorldModelLoss, kl_losses, open_loop_loss
 from dreamer_racing.modules import SIZES, Agent, Interface
+from dreamer_racing.modules.rssm import CONTEXT
 from tests.dreamers import latent_ppo_of, learner_of, make_windows
-from tests.learners.test_dreamer_v3 import make_batch
+from tests.experience.test_replay import CountingEnv, collect
+from tests.learners.test_dreamer_v3 import CONFIG, make_batch
 from tests.learners.test_latent_ppo import PPO, make_rollout
+from tests.losses.test_targets import ADDED
 
 
 def make_records(image_size: int = 64) -> TensorDict:
@@ -94,13 +98,14 @@ def test_continue_target_is_one_minus_terminated():
 
 
 def test_rewards_and_ends_ahead_are_learned_within_an_episode():
-    agent = agent_that_goes_on()
-    batch = make_records()  # an episode begins at the third record of the first window, behind one that ended
+    agent, batch = agent_that_goes_on(), make_records()  # an episode begins at the first window's third record
     latents = WorldModelLoss(agent, LossConfig())(batch)[1]
     loss = open_loop_loss(agent.world_model, latents, batch, steps=2)
     within = 1 + 4  # from the first window the end of its first episode, from both starts of the second both steps
     expected = math.log(255) - (4 * math.log(0.75) + 1 * math.log(0.25)) / within
     assert loss.item() == pytest.approx(expected, rel=1e-5)
+    with pytest.raises(ValueError, match=r"open_loop_steps=4 must be less than the 4 records of a window"):
+        open_loop_loss(agent.world_model, latents, batch, steps=4)
 
 
 def test_dynamics_learn_from_rewards_ahead():
@@ -113,33 +118,9 @@ def test_dynamics_learn_from_rewards_ahead():
         assert any(parameter.grad.abs().sum() > 0 for parameter in network.parameters())
 
 
-def test_windows_must_be_longer_than_what_is_predicted_ahead():
-    agent, batch = Agent(SIZES["debug"], Interface()), make_records()
-    latents = WorldModelLoss(agent, LossConfig())(batch)[1]
-    with pytest.raises(ValueError, match=r"open_loop_steps=4 must be less than the 4 records of a window"):
-        open_loop_loss(agent.world_model, latents, batch, steps=4)
-
-
-@pytest.mark.parametrize("image_size", [32, 64, 96])
-def test_every_parameter_of_the_world_model_gets_a_gradient(image_size):
-    agent = Agent(SIZES["debug"], Interface(image_size=image_size))
-    world_model = agent.world_model
-    with torch.no_grad():
-        world_model.reward_head.mlp.output.weight.normal_()  # zero at first, which hides what lies below
-    losses, _ = WorldModelLoss(agent, LossConfig(free_nats=0.0))(make_records(image_size))
-    sum(value for key, value in losses.items() if key.startswith("loss_")).backward()
-    for name, parameter in world_model.named_parameters():
-        assert not parameter.requires_grad or parameter.grad.abs().sum() > 0, name
-
-
 def test_a_refreshed_context_is_what_the_next_window_begins_with():
     """From the learner's update through the replay into the next sample."""
-    from dreamer_racing.experience.replay import make_replay
-    from dreamer_racing.modules.rssm import CONTEXT
-    from tests.experience.test_replay import CountingEnv, collect
-
-    config = {"horizon": 2, "imagination_starts": 4, "learning_rate": 1e-3, "warmup_updates": 0}
-    learner = learner_of(seed=0, **config)
+    learner = learner_of(seed=0, imagination_starts=4, **CONFIG)
     rollout = collect(CountingEnv(2, end=0.0, image_shape=(64, 64, 3)), steps=9, batches=1)[0]
     rollout["next", "belief"], rollout["next", "state"] = torch.zeros(2, 9, 32), torch.zeros(2, 9, 16)
     replay = make_replay(20, 2, 1, 10, latents=learner.latent_format)
@@ -159,7 +140,6 @@ def test_a_refreshed_context_is_what_the_next_window_begins_with():
 PAGE = (Path(__file__).parents[2] / "docs" / "losses.md").read_text(encoding="utf-8")
 BLOCKS = re.findall(r"^```python\n(.*?)^```$", PAGE, re.MULTILINE | re.DOTALL)
 LARGER = (Path(__file__).parents[2] / "examples" / "losses" / "overshooting.py").read_text(encoding="utf-8")
-CONFIG = {"horizon": 4, "learning_rate": 1e-3, "warmup_updates": 0}
 
 
 @pytest.fixture
@@ -173,7 +153,8 @@ def my_losses(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Modul
     del sys.modules["my_losses"]
 
 
-def test_a_target_is_learned_beside_others(my_losses):
+@pytest.mark.usefixtures("my_losses")
+def test_a_target_is_learned_beside_others():
     learner = learner_of(seed=0, world_model="reconstruction+my_losses:Overshooting", **CONFIG)
     for _ in range(3):
         metrics = learner.update(make_batch())
@@ -183,9 +164,9 @@ def test_a_target_is_learned_beside_others(my_losses):
     torch.testing.assert_close(metrics["loss"], total)
 
 
-def test_the_smallest_target_is_learned(my_losses):
-    learner = learner_of(seed=0, world_model="reconstruction+my_losses:LastAction", **CONFIG)
-    metrics = learner.update(make_batch())
+@pytest.mark.usefixtures("my_losses")
+def test_the_smallest_target_is_learned():
+    metrics = learner_of(seed=0, world_model="reconstruction+my_losses:LastAction", **CONFIG).update(make_batch())
     assert metrics["loss_last_action"] > 0 and "loss_image" in metrics
 
 
@@ -251,14 +232,9 @@ def test_an_objective_of_latent_ppo_is_what_moves_the_actor(my_losses):
 
 def test_the_page_names_every_target_and_what_it_adds():
     quoted = set(re.findall(r"`([^`]+)`", re.sub(r"```.*?```", "", PAGE, flags=re.DOTALL)))
+    assert "loss_vector" in quoted
     for name, targets in TARGETS.items():
         row = re.search(rf"^\| `{name}` \| (.*?) \|", PAGE, re.MULTILINE)
         listed = re.findall(r"`(\w+)`", row[1]) if row else []
         assert listed == [target.__name__ for target in targets], name
-        learner = learner_of(interface=Interface(vector_dim=3, privileged_dim=5), world_model=name)
-        batch = make_batch()
-        batch["vector"] = torch.zeros(*batch.shape, 3)
-        batch["privileged", "vector"] = torch.zeros(*batch.shape, 5)
-        added = learner.world_model_loss(batch)[0].keys()
-        always = {"loss_reward", "loss_continue", "reward_error", "loss_dynamics", "loss_representation", "kl"}
-        assert added - always <= quoted, name
+        assert ADDED[name] <= quoted, name

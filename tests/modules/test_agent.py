@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import replace
 
 import pytest
@@ -54,12 +55,26 @@ def make_env(policy: DreamerPolicy) -> TransformedEnv:
     return env
 
 
+def collected(policy: DreamerPolicy) -> TensorDict:
+    """A collector's rollout [3, 12]."""
+    collector = Collector(make_env(policy), policy, frames_per_batch=36, total_frames=36)
+    rollout = next(iter(collector))
+    collector.shutdown()
+    return rollout
+
+
+def streams_of(rollout: TensorDict, latents: LatentFormat) -> Iterator[TensorDict]:
+    """Records of each environment, in their order, with stored latents."""
+    records = records_from_rollout(rollout, reward_keys=("reward",), latents=latents)
+    for stream in range(3):
+        own = records[records["stream"] == stream]
+        yield own[own["order"].argsort()]
+
+
 def test_collected_latents_equal_those_of_training():
     """Across partial resets, unrolling over what a collector recorded gives the latents that acted."""
     agent, policy = make_policy(deterministic=True)
-    collector = Collector(make_env(policy), policy, frames_per_batch=36, total_frames=36)
-    data = next(iter(collector))
-    collector.shutdown()
+    data = collected(policy)
     is_init = data["is_init"].squeeze(-1)
     assert data.batch_size == (3, 12)
     assert is_init.sum(-1).tolist() == [6, 4, 3]
@@ -75,14 +90,8 @@ def test_collected_latents_equal_those_of_training():
 def test_stored_context_lets_a_window_go_on_from_where_acting_was(sampled):
     """At every record of a window: also where an episode ends inside it, and at the first record of all."""
     agent, policy = make_policy(deterministic=True, sampled=sampled)
-    collector = Collector(make_env(policy), policy, frames_per_batch=36, total_frames=36)
-    data = next(iter(collector))
-    collector.shutdown()
     rssm = agent.world_model.rssm
-    records = records_from_rollout(data, reward_keys=("reward",), latents=rssm.latent_format)
-    for stream in range(3):
-        own = records[records["stream"] == stream]
-        own = own[own["order"].argsort()]
+    for own in streams_of(collected(policy), rssm.latent_format):
         acted = agent.world_model.observe(
             own.unsqueeze(0), own["previous_action"][None], own["is_init"].squeeze(-1)[None], deterministic=True
         )
@@ -98,16 +107,11 @@ def test_stored_context_lets_a_window_go_on_from_where_acting_was(sampled):
             torch.testing.assert_close(seen.belief, acted.belief[:, start:], atol=2e-3, rtol=0)
 
 
-def test_rollout_of_the_policy_samples_and_needs_no_gradient():
+def test_the_policy_samples_without_gradient_unless_it_is_deterministic():
     _, policy = make_policy()
     data = make_env(policy).rollout(5, policy, auto_reset=True, break_when_any_done=False)
     assert data["action"].shape == (3, 5, 4)
-    assert not data["action"].requires_grad
-    assert not data["next", "belief"].requires_grad
-
-
-def test_deterministic_flag_switches_sampling_off():
-    _, policy = make_policy()
+    assert not data["action"].requires_grad and not data["next", "belief"].requires_grad
     root = make_env(policy).reset()
     assert not torch.equal(policy(root.clone())["action"], policy(root.clone())["action"])
     policy.deterministic = True
@@ -136,8 +140,8 @@ def test_policy_takes_any_batch_size(batch):
 # Latents that a replay keeps come back as they were.
 
 
-@pytest.mark.parametrize("sampled", [True, False])
-def test_latents_survive_packing(sampled):
+@pytest.mark.parametrize(("sampled", "large"), [(True, 512 + 16), (False, 512 + 512)])
+def test_latents_survive_packing_in_the_bytes_that_are_told(sampled, large):
     rssm = rssm_of(sampled=sampled)
     posterior = rssm.observe(torch.randn(2, 5, 8), torch.randn(2, 5, 4), torch.zeros(2, 5, dtype=torch.bool))
     packed = rssm.latent_format.pack(posterior.belief, posterior.state)
@@ -146,11 +150,7 @@ def test_latents_survive_packing(sampled):
     torch.testing.assert_close(state, posterior.state, atol=0 if sampled else 5e-4, rtol=0)
     stored = sum(value.element_size() * value[0, 0].numel() for value in packed.values())
     assert stored == rssm.latent_format.bytes
-
-
-def test_bytes_of_a_record_by_hand():
-    assert LatentFormat(belief=256, latents=16, classes=16).bytes == 512 + 16
-    assert LatentFormat(belief=256, latents=16, classes=16, sampled=False).bytes == 512 + 512
+    assert LatentFormat(belief=256, latents=16, classes=16, sampled=sampled).bytes == large, "by hand"
 
 
 def test_probabilities_draw_nothing_and_sum_to_one():

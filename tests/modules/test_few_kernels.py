@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from contextlib import nullcontext
 from dataclasses import replace
 
 import pytest
@@ -142,13 +143,9 @@ def test_weights_are_cast_by_one_kernel_and_come_back() -> None:
 
     def run(once: bool) -> list[Tensor]:
         module.zero_grad()
-        with autocast(torch.device("cpu"), True):
-            if once:
-                with cast_once(module, torch.bfloat16):
-                    assert all(parameter.dtype == torch.bfloat16 for parameter in module.parameters())
-                    module(inputs).float().square().sum().backward()
-            else:
-                module(inputs).float().square().sum().backward()
+        with autocast(torch.device("cpu"), True), cast_once(module, torch.bfloat16) if once else nullcontext():
+            assert all((parameter.dtype == torch.bfloat16) == once for parameter in module.parameters())
+            module(inputs).float().square().sum().backward()
         return [parameter.grad for parameter in module.parameters()]
 
     for one, other in zip(run(True), run(False), strict=True):
@@ -185,46 +182,30 @@ def test_it_is_not_the_default_of_a_cpu() -> None:
 # Weight gradients that come after a time loop are those that come at every step.
 
 
-def roll(layers: torch.nn.Module, inputs: torch.Tensor, deferred: bool) -> torch.Tensor:
+def roll(layers: nn.Module, inputs: Tensor, deferred: bool) -> Tensor:
     hidden = inputs
-    if not deferred:
-        for _ in range(4):
-            hidden = torch.tanh(layers(hidden))
-        return hidden
-    with unrolled(layers):
+    with unrolled(layers) if deferred else nullcontext():
         for _ in range(4):
             hidden = torch.tanh(layers(hidden))
         layers(hidden)  # a step whose output nothing needs
-    return hidden
+    return hidden.square().sum()
 
 
-def make_layers() -> torch.nn.Module:
-    torch.manual_seed(0)
-    return torch.nn.Sequential(linear(6, 6), BlockLinear(6, 6, blocks=2), linear(6, 6, bias=False)).double()
-
-
-def gradients_of(deferred: bool) -> list[torch.Tensor]:
-    layers = make_layers()
-    inputs = torch.linspace(-1, 1, 18, dtype=torch.float64).view(3, 6).requires_grad_()
-    roll(layers, inputs, deferred).square().sum().backward()
-    return [inputs.grad, *(parameter.grad for parameter in layers.parameters())]
-
-
-def test_gradients_are_the_same() -> None:
-    for found, expected in zip(gradients_of(True), gradients_of(False), strict=True):
-        torch.testing.assert_close(found, expected, rtol=1e-12, atol=1e-12)
-
-
-def test_a_backward_pass_that_does_not_want_the_weights_leaves_nothing_behind() -> None:
-    layers = make_layers()
-    inputs = torch.ones(3, 6, dtype=torch.float64, requires_grad=True)
-    loss = roll(layers, inputs, deferred=True).square().sum()
-    torch.autograd.grad(loss, inputs, retain_graph=True)
-    loss.backward()
-    plain = make_layers()
-    roll(plain, torch.ones(3, 6, dtype=torch.float64), deferred=False).square().sum().backward()
-    for found, expected in zip(layers.parameters(), plain.parameters(), strict=True):
-        torch.testing.assert_close(found.grad, expected.grad)
+@pytest.mark.parametrize("inputs_alone_before", [False, True])
+def test_deferred_gradients_are_the_same_also_after_a_pass_that_does_not_want_the_weights(
+    inputs_alone_before: bool,
+) -> None:
+    found = []
+    for deferred in (True, False):
+        torch.manual_seed(0)
+        layers = nn.Sequential(linear(6, 6), BlockLinear(6, 6, blocks=2), linear(6, 6, bias=False)).double()
+        inputs = torch.linspace(-1, 1, 18, dtype=torch.float64).view(3, 6).requires_grad_()
+        loss = roll(layers, inputs, deferred)
+        if inputs_alone_before:
+            torch.autograd.grad(loss, inputs, retain_graph=True)
+        loss.backward()
+        found.append([inputs.grad, *(parameter.grad for parameter in layers.parameters())])
+    torch.testing.assert_close(*found, rtol=1e-12, atol=1e-12)
 
 
 @pytest.mark.parametrize("enabled", [False, True])

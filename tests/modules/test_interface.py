@@ -28,6 +28,7 @@ from dreamer_racing.modules import (
 from dreamer_racing.modules.agent import Agent
 from dreamer_racing.modules.heads import symlog
 from dreamer_racing.modules.interface import IMU, PIXELS, PRIVILEGED
+from tests.dreamers import make_windows
 
 
 class SpecEnv(EnvBase):
@@ -50,68 +51,71 @@ def images(num_envs: int, height: int = 64, width: int = 64) -> Bounded:
     return Bounded(0, 255, (num_envs, height, width, 3), dtype=torch.uint8)
 
 
+def privileged_of(num_envs: int, **widths: int) -> Composite:
+    return Composite({key: Unbounded((num_envs, width)) for key, width in widths.items()}, shape=[num_envs])
+
+
 @pytest.mark.parametrize("num_envs", [1, 3])
-def test_interface_of_any_environment(num_envs):
-    """The last dimension counts, whatever the number of environments."""
-    privileged = Composite(vector=Unbounded((num_envs, 9)), position=Unbounded((num_envs, 3)), shape=[num_envs])
-    env = SpecEnv(num_envs, 2, pixels=images(num_envs), vector=Unbounded((num_envs, 5)), privileged=privileged)
-    interface = Interface.of(env)
-    assert interface == Interface(action_dim=2, pixels=True, vector_dim=5, privileged_dim=9)
-    assert interface.observation_keys == ["pixels", "vector"]
-    assert interface.replay_keys == ["pixels", "vector", PRIVILEGED]
+@pytest.mark.parametrize(
+    ("make_observation", "expected", "keys"),
+    [
+        (lambda n: {"pixels": images(n)}, Interface(action_dim=2), ["pixels"]),
+        (lambda n: {"pixels": images(n, 96, 96)}, Interface(action_dim=2, image_size=96), ["pixels"]),
+        (
+            lambda n: {"pixels": images(n), "vector": Unbounded((n, 5)), "privileged": privileged_of(n, vector=9, x=3)},
+            Interface(action_dim=2, vector_dim=5, privileged_dim=9),
+            ["pixels", "vector", PRIVILEGED],
+        ),
+        # Privileged entries other than the vector do not count.
+        (lambda n: {"pixels": images(n), "privileged": privileged_of(n, x=3)}, Interface(action_dim=2), ["pixels"]),
+        (lambda n: {"vector": Unbounded((n, 5))}, Interface(action_dim=2, pixels=False, vector_dim=5), ["vector"]),
+        (
+            lambda n: {"vector": Unbounded((n, 5)), "privileged": privileged_of(n, vector=9)},
+            Interface(action_dim=2, pixels=False, vector_dim=5, privileged_dim=9),
+            ["vector", PRIVILEGED],
+        ),
+    ],
+    ids=["pixels", "large", "all", "other", "vector", "numbers"],
+)
+def test_interface_of_any_environment(make_observation, expected, keys, num_envs):
+    """The last dimension counts, whatever the number of environments; the encoder never reads what is privileged."""
+    env = SpecEnv(num_envs, 2, **make_observation(num_envs))
+    assert Interface.of(env) == Interface.of(TransformedEnv(env, InitTracker())) == expected
+    assert expected.image_shape == (expected.image_size, expected.image_size, 3)
+    assert expected.observation_keys == [key for key in keys if key != PRIVILEGED]
+    assert expected.replay_keys == keys
 
 
-def test_privileged_entries_other_than_the_vector_do_not_count():
-    privileged = Composite(position=Unbounded((3, 3)), shape=[3])
-    assert Interface.of(SpecEnv(3, 4, pixels=images(3), privileged=privileged)) == Interface()
-
-
-def test_interface_of_a_transformed_environment():
-    env = TransformedEnv(SpecEnv(3, 4, vector=Unbounded((3, 5))), InitTracker())
-    assert Interface.of(env) == Interface(pixels=False, vector_dim=5)
-
-
-def test_size_of_the_images():
-    assert Interface.of(SpecEnv(3, 4, pixels=images(3, 96, 96))) == Interface(image_size=96)
-    assert Interface(image_size=96).image_shape == (96, 96, 3)
-    with pytest.raises(ValueError, match="48 × 32 pixels: agents need square images"):
-        Interface.of(SpecEnv(3, 4, pixels=images(3, 48, 32)))
-
-
-def test_an_agent_that_sees_nothing_is_refused():
+def test_an_agent_that_sees_nothing_or_no_squares_is_refused():
     with pytest.raises(ValueError, match="neither 'pixels' nor 'vector'"):
         Interface.of(SpecEnv(3, 4, sound=Unbounded((3, 5))))
     with pytest.raises(ValueError, match="sees nothing"):
         Interface(pixels=False)
+    with pytest.raises(ValueError, match="48 × 32 pixels: agents need square images"):
+        Interface.of(SpecEnv(3, 4, pixels=images(3, 48, 32)))
 
 
 @pytest.mark.parametrize(
-    ("interface", "observation_keys", "replay_keys"),
-    [
-        (Interface(), ["pixels"], ["pixels"]),
-        (Interface(privileged_dim=3), ["pixels"], ["pixels", PRIVILEGED]),
-        (Interface(pixels=False, vector_dim=2), ["vector"], ["vector"]),
-        (Interface(pixels=False, vector_dim=2, privileged_dim=3), ["vector"], ["vector", PRIVILEGED]),
-        (Interface(vector_dim=2), ["pixels", "vector"], ["pixels", "vector"]),
-    ],
-)
-def test_keys(interface, observation_keys, replay_keys):
-    """The encoder never reads what is privileged."""
-    assert interface.observation_keys == observation_keys
-    assert interface.replay_keys == replay_keys
-
-
-@pytest.mark.parametrize("privileged", [False, True])
-@pytest.mark.parametrize("from_pixels", [False, True])
-def test_interface_of_the_race(from_pixels, privileged):
-    env = DroneRacingEnv(track="circle", num_envs=2, from_pixels=from_pixels, privileged=privileged, seed=0)
-    interface = Interface.of(env)
-    reset = env.reset()
+    "options",
+    [*({"from_pixels": seen, "privileged": told} for seen in (False, True) for told in (False, True)),
+     {"imu": "exact", "camera": Camera(32, 32), "privileged": True}],
+    ids=str,
+)  # fmt: skip
+def test_interface_of_the_race(options):
+    env = DroneRacingEnv(track="circle", num_envs=2, seed=0, **options)
+    interface, reset = Interface.of(env), env.reset()
     env.close()
-    assert interface.action_dim == 4
-    assert interface.pixels == from_pixels == ("pixels" in reset.keys())  # noqa: SIM118
-    assert interface.vector_dim == (0 if from_pixels else reset["vector"].shape[-1])
-    assert interface.privileged_dim == (reset[PRIVILEGED].shape[-1] if privileged else 0)
+    seen = [key for key in (PIXELS, "vector", IMU) if reset.get(key, None) is not None]
+    numbers = [key for key in seen if key != PIXELS]
+    assert interface == Interface(
+        action_dim=4,
+        pixels=options.get("from_pixels", True),
+        image_size=32 if "camera" in options else 64,
+        vector_dim=6 if "imu" in options else reset["vector"].shape[-1] if numbers else 0,
+        privileged_dim=reset[PRIVILEGED].shape[-1] if options["privileged"] else 0,
+        vector_key=IMU if "imu" in options else "vector",
+    )
+    assert interface.observation_keys == seen and bool(numbers) == ("imu" in options or not interface.pixels)
     for key in interface.replay_keys:
         assert reset[key].shape[0] == 2
 
@@ -158,10 +162,8 @@ def test_squared_error_by_hand():
 
 @pytest.mark.parametrize("sight", SIGHTS)
 def test_observation_encoder_puts_embeddings_side_by_side(sight):
-    interface = SIGHTS[sight]
-    encoder = ObservationEncoder(SIZE, interface)
-    assert encoder.keys == interface.observation_keys
-    assert list(encoder.encoders) == encoder.keys
+    encoder = ObservationEncoder(replace(SIZE, name="wider", vector_layers=4, units=24), SIGHTS[sight])
+    assert encoder.keys == list(encoder.encoders) == SIGHTS[sight].observation_keys
     seen = {
         "pixels": torch.randint(0, 256, (2, 3, 64, 64, 3), dtype=torch.uint8),
         "vector": torch.randn(2, 3, VECTOR_DIM),
@@ -169,31 +171,13 @@ def test_observation_encoder_puts_embeddings_side_by_side(sight):
     }
     embedding = encoder(seen)
     assert embedding.shape == (2, 3, encoder.embedding_size)
-    parts = [encoder.encoders[key](seen[key]) for key in encoder.keys]
-    assert torch.equal(embedding, torch.cat(parts, -1))
-    assert isinstance(encoder.encoders["vector"], VectorEncoder)
+    assert torch.equal(embedding, torch.cat([encoder.encoders[key](seen[key]) for key in encoder.keys], -1))
+    of_numbers = encoder.encoders["vector"]
+    assert isinstance(of_numbers, VectorEncoder)
+    assert (len(of_numbers.hidden), of_numbers.embedding_size) == (4, 24), "as the size says"
     if sight == "both":
         assert isinstance(encoder.encoders["pixels"], ImageEncoder)
-        widths = [part.embedding_size for part in encoder.encoders.values()]
-        assert encoder.embedding_size == sum(widths) and min(widths) > 0
-
-
-def test_observation_encoder_takes_its_widths_from_the_size():
-    size = replace(SIZE, name="wider", vector_layers=4, units=24)
-    encoder = ObservationEncoder(size, SIGHTS["vector"]).encoders["vector"]
-    assert len(encoder.hidden) == 4
-    assert encoder.embedding_size == 24
-
-
-def make_history(sight: str, batch: int = 2, time: int = 8) -> TensorDict:
-    """What two drones saw and did, one of which crashed twice."""
-    torch.manual_seed(1)
-    is_init = torch.zeros(batch, time, 1, dtype=torch.bool)
-    is_init[:, 0] = is_init[1, 3] = is_init[1, 4] = True
-    seen = {"vector": torch.randn(batch, time, VECTOR_DIM) * 3}
-    if sight == "both":
-        seen["pixels"] = torch.randint(0, 256, (batch, time, 64, 64, 3), dtype=torch.uint8)
-    return TensorDict({**seen, "is_init": is_init}, [batch, time])
+        assert encoder.embedding_size == 24 + encoder.encoders["pixels"].embedding_size > 24
 
 
 @pytest.mark.parametrize("recurrence", ["dense", "block"])
@@ -202,8 +186,9 @@ def test_acting_and_training_give_the_same_latents(sight, recurrence, monkeypatc
     """Sampled actions and states, carried by the policy's own keys from step to step, with resets in the middle."""
     torch.manual_seed(0)
     size = replace(SIZE, name="variant", recurrence=recurrence, blocks=2, learned_initial=True)
-    agent, history = Agent(size, SIGHTS[sight]), make_history(sight)
+    agent = Agent(size, SIGHTS[sight])
     rssm = agent.world_model.rssm
+    history = make_windows(2, 8, is_init=[(0, 0), (1, 0), (1, 3), (1, 4)], vector=VECTOR_DIM)
     with torch.no_grad():
         rssm.initial_belief.normal_()
         agent.actor.mlp.output.weight.mul_(100.0)
@@ -220,8 +205,7 @@ def test_acting_and_training_give_the_same_latents(sight, recurrence, monkeypatc
 
     monkeypatch.setattr(rssm, "draw_noise", lambda *batch: noise)
     # As a replay stores it: the action that led to each observation, zero at a first one.
-    previous_action = torch.cat((torch.zeros(2, 1, 4), acted["action"][:, :-1]), 1)
-    previous_action = previous_action.masked_fill(history["is_init"], 0.0)
+    previous_action = acted["action"].roll(1, 1).masked_fill(history["is_init"], 0.0)
     posterior = agent.world_model.observe(history, previous_action, history["is_init"].squeeze(-1))
     torch.testing.assert_close(posterior.belief, acted["next", "belief"])
     torch.testing.assert_close(posterior.state, acted["next", "state"])
@@ -230,23 +214,14 @@ def test_acting_and_training_give_the_same_latents(sight, recurrence, monkeypatc
 
 def test_policy_of_an_agent_that_sees_numbers_asks_for_no_images():
     agent = Agent(SIZE, SIGHTS["vector"])
-    policy = DreamerPolicy(agent.world_model, agent.actor)
-    assert policy.in_keys == ["vector", "is_init", "belief", "state", "previous_action"]
+    keys = DreamerPolicy(agent.world_model, agent.actor).in_keys
+    assert keys == ["vector", "is_init", "belief", "state", "previous_action"]
 
 
 # Networks that see what an IMU tells beside images: the world model's, and the baselines'.
 
 
 SEEN = Interface(image_size=32, vector_dim=6, vector_key=IMU)
-
-
-def test_the_interface_is_read_off_the_environment() -> None:
-    env = DroneRacingEnv("circle", 1, imu="exact", camera=Camera(32, 32), privileged=True)
-    interface = Interface.of(env)
-    env.close()
-    assert (interface.vector_key, interface.vector_dim, interface.image_size) == (IMU, 6, 32)
-    assert interface.observation_keys == [PIXELS, IMU]
-    assert interface.replay_keys == [PIXELS, IMU, PRIVILEGED]
 
 
 def test_the_world_model_reads_both_and_decodes_both() -> None:

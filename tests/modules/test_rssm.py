@@ -8,7 +8,7 @@ from dataclasses import replace
 import pytest
 import torch
 
-from dreamer_racing.modules import RSSM, SIZES
+from dreamer_racing.modules import RSSM, SIZES, join_features
 from dreamer_racing.modules.recurrent_cells import BlockGRUCell
 from dreamer_racing.modules.rssm import mix_uniform, sample_one_hot
 from tests.dreamers import rssm_of
@@ -17,6 +17,7 @@ KINDS = [
     {"recurrence": "dense", "norm": "layer", "learned_initial": False},
     {"recurrence": "dense", "norm": "layer", "learned_initial": True},
     {"recurrence": "block", "norm": "rms", "learned_initial": False},
+    {"recurrence": "block", "norm": "rms", "learned_initial": True},
 ]
 
 
@@ -64,13 +65,18 @@ def test_sample_passes_the_gradient_straight_through():
 @pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize("deterministic", [False, True])
 def test_unroll_equals_acting_step_by_step(kind, deterministic, monkeypatch):
-    """Acting and training give the same latents for the same history, also across a reset inside the window."""
+    """Acting and training give the same latents and gradients for a history, also across a reset inside the window."""
     rssm = make_rssm(**kind)
     embedding, action, is_init = make_sequence()
-    noise = torch.rand(6, 2, 3, 1)
+    noise, weight = torch.rand(6, 2, 3, 1), torch.randn(6, 2, 28)
+    parameters = {name: parameter for name, parameter in rssm.named_parameters() if parameter.requires_grad}
     monkeypatch.setattr(rssm, "draw_noise", lambda *batch: noise)
     posterior = rssm.observe(embedding, action, is_init, deterministic=deterministic)
+    features = join_features(posterior.belief, posterior.state).transpose(0, 1)
+    unrolled = torch.autograd.grad((features * weight).sum(), list(parameters.values()), allow_unused=True)
+
     belief, state = (value.expand(2, -1) for value in rssm.initial())
+    total = torch.zeros(())
     for step in range(6):
         monkeypatch.setattr(rssm, "draw_noise", lambda *batch, step=step: noise[step])
         belief, state = rssm.observe_step(
@@ -78,6 +84,13 @@ def test_unroll_equals_acting_step_by_step(kind, deterministic, monkeypatch):
         )
         torch.testing.assert_close(belief, posterior.belief[:, step])
         torch.testing.assert_close(state, posterior.state[:, step])
+        total = total + (join_features(belief, state) * weight[step]).sum()
+    stepped = torch.autograd.grad(total, list(parameters.values()), allow_unused=True)
+    for name, one, other in zip(parameters, unrolled, stepped, strict=True):
+        assert (one is None) == (other is None), name
+        if one is not None:
+            assert (one - other).norm() <= 1e-5 * other.norm() + 1e-7, name
+    assert sum(gradient is not None and bool(gradient.any()) for gradient in unrolled) > 8
 
 
 @pytest.mark.parametrize("kind", KINDS)
