@@ -19,7 +19,7 @@ from torchrl.envs.transforms import Compose, Transform
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 from torchrl.modules import ProbabilisticActor
 
-from dreamer_racing.learners.gradient_step import FiniteGuard, gradient_norms
+from dreamer_racing.learners.gradient_step import FiniteGuard, gradient_norms, restore
 from dreamer_racing.learners.learner import ValueFunction
 from dreamer_racing.modules import Interface
 from dreamer_racing.modules.heads import symlog
@@ -267,9 +267,7 @@ class BaselineLearner(ABC):
         check_layers(state_dict["size"], self._size)
         for name, module in self._modules().items():
             module.load_state_dict(state_dict[name])
-        rate = self.optimizer.param_groups[0]["lr"]
-        self.optimizer.load_state_dict(state_dict["optimizer"])
-        self.optimizer.param_groups[0]["lr"] = rate  # a setting of this learner, not state
+        restore(self.optimizer, state_dict["optimizer"])
         self.updates = state_dict["updates"]
 
     def _gradient_step(

@@ -306,24 +306,19 @@ class Actor(nn.Module):
         self.few_kernels = False
         self.action_dim = action_dim
         shift = torch.tensor([0.0, STD_SHIFT] if state_std else [0.0]).repeat_interleave(action_dim)
-        self.shift = nn.Buffer(shift, persistent=False)  # added to the network's output
+        self.shift = nn.Buffer(shift, persistent=False)  # added to the network's output by ``few_kernels``
         self.min_std = nn.Buffer(torch.tensor(float(min_std)))
         self.max_std = nn.Buffer(torch.tensor(float(max_std)))
 
     def forward(self, features: Tensor) -> ActionDistribution:
         """Map ``(..., F)`` to a distribution over actions ``(..., A)``."""
-        if self.few_kernels:
-            return self._with_few_kernels(self.mlp(features))
-        output = self.mlp(features).float()
-        mean, raw_std = output.chunk(2, -1) if self.raw_std is None else (output, self.raw_std.expand_as(output))
-        std = (self.max_std - self.min_std) * torch.sigmoid(raw_std + STD_SHIFT) + self.min_std
-        return ActionDistribution(torch.tanh(mean), std)
-
-    def _with_few_kernels(self, output: Tensor) -> ActionDistribution:
-        """Map the MLP's output ``(..., 2·A)`` or ``(..., A)`` of any type to the distribution, as ``forward`` does."""
-        output = output + self.shift  # in float32
+        output = self.mlp(features)
+        output = output + self.shift if self.few_kernels else output.float()  # in float32
         if self.raw_std is None:
             mean, shifted = output.chunk(2, -1)
+            shifted = shifted if self.few_kernels else shifted + STD_SHIFT
         else:
             mean, shifted = output, (self.raw_std + STD_SHIFT).expand_as(output)
-        return ActionDistribution(torch.tanh(mean), torch.lerp(self.min_std, self.max_std, torch.sigmoid(shifted)))
+        low, high, share = self.min_std, self.max_std, torch.sigmoid(shifted)
+        std = torch.lerp(low, high, share) if self.few_kernels else (high - low) * share + low
+        return ActionDistribution(torch.tanh(mean), std)
