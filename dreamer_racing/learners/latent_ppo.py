@@ -317,21 +317,28 @@ class PPOUpdate:
         self.learning_rate_scale.copy_(state_dict["learning_rate_scale"])
 
     def _make_epochs(self, number: int, loss: MinibatchLoss) -> dict[str, Tensor]:
+        """Make the gradient steps; average metrics over those that were applied, but keep the last ``ppo/kl``."""
         minibatches = math.ceil(number / self.config.minibatch)
         active = torch.ones((), dtype=torch.bool, device=self.device)
         done, applied = list[dict[str, Tensor]](), list[Tensor]()
-        for _ in range(self.config.epochs):
-            # The sizes of minibatches differ by at most one.
-            for chosen in torch.randperm(number, device=self.device).tensor_split(minibatches):
-                metrics = self._step(*loss(chosen), active)
-                done.append(metrics)
-                applied.append(active)
-                if "ppo/kl" not in metrics:
-                    continue
+        orders = (torch.randperm(number, device=self.device) for _ in range(self.config.epochs))
+        # The sizes of minibatches differ by at most one.
+        for chosen in (part for order in orders for part in order.tensor_split(minibatches)):
+            metrics = self._step(*loss(chosen), active)
+            done.append(metrics)
+            applied.append(active)
+            if "ppo/kl" in metrics:
                 active = active & (metrics["ppo/kl"] <= self.config.kl_stop)
                 if not self._masked and not active:
-                    return _summary(done, applied, minibatches)
-        return _summary(done, applied, minibatches)
+                    break
+        mask = torch.stack(applied)
+        steps = mask.sum()
+        values = {name: torch.stack([metrics[name] for metrics in done]) for name in done[0]}
+        means = {name: value.where(mask, 0.0).sum() / steps for name, value in values.items()}
+        if "ppo/kl" in values:
+            means["ppo/kl"] = values["ppo/kl"].gather(0, steps.unsqueeze(0) - 1).squeeze(0)
+            means["ppo/epochs"] = steps.to(means["ppo/kl"].dtype) / minibatches
+        return means
 
     def _step(self, loss: Tensor, metrics: dict[str, Tensor], active: Tensor) -> dict[str, Tensor]:
         """Make one gradient step if ``active`` (a bool scalar) and if the gradient is finite."""
@@ -360,15 +367,3 @@ class PPOUpdate:
         lower, higher = (scale / RATE_CHANGE).clamp(min=SMALLEST_SCALE), (scale * RATE_CHANGE).clamp(max=1.0)
         changed = torch.where(kl < target / KL_TOLERANCE, higher, scale)
         scale.copy_(torch.where(kl <= KL_TOLERANCE * target, changed, lower))  # lower also if kl is NaN
-
-
-def _summary(done: list[dict[str, Tensor]], applied: list[Tensor], minibatches: int) -> dict[str, Tensor]:
-    """Average metrics over the gradient steps that were ``applied`` (bool scalars); ``ppo/kl`` is the last one's."""
-    mask = torch.stack(applied)
-    number = mask.sum()
-    values = {name: torch.stack([metrics[name] for metrics in done]) for name in done[0]}
-    means = {name: value.where(mask, 0.0).sum() / number for name, value in values.items()}
-    if "ppo/kl" not in values:
-        return means
-    kl = values["ppo/kl"].gather(0, number.unsqueeze(0) - 1).squeeze(0)
-    return means | {"ppo/kl": kl, "ppo/epochs": number.to(kl.dtype) / minibatches}

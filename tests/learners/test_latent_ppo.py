@@ -20,7 +20,7 @@ from dreamer_racing.modules import Interface, join_features
 from dreamer_racing.modules.heads import ActionDistribution, symlog
 from tests.dreamers import latent_ppo_of
 from tests.launches import launches
-from tests.learners.test_dreamer_v3 import make_batch
+from tests.learners.test_dreamer_v3 import make_batch, watch
 
 N, T, P = 3, 4, 5
 PPO = PPOUpdateConfig(steps=2 * N * T, epochs=4, minibatch=16, learning_rate=1e-2, kl_stop=1e9)
@@ -141,9 +141,7 @@ def test_advantages_come_of_what_was_paid_and_of_the_critic_s_own_values(critic)
     learner = make_learner(critic, ppo=replace(PPO, steps=N * T, epochs=1, minibatch=1000))
     torch.nn.init.normal_(learner.critic.mlp.output.weight)
     torch.nn.init.normal_(learner.agent.critic.head.mlp.output.weight)
-    rollout, seen = make_rollout(learner), []
-    objective = learner.objective
-    learner.objective = lambda trajectory, **numbers: seen.append(trajectory) or objective(trajectory, **numbers)
+    rollout, seen = make_rollout(learner), watch(learner)
     inputs = rollout["privileged", "vector"]
     inputs = symlog(inputs) if critic == "state" else join_features(rollout["next", "belief"], rollout["next", "state"])
     with torch.no_grad():
