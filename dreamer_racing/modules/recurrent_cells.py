@@ -20,12 +20,6 @@ UPDATE_SHIFT = 1.0
 """Subtracted from the update gate, so that an untrained cell remembers rather than overwrites."""
 
 
-def gated_update(reset: Tensor, candidate: Tensor, update: Tensor, belief: Tensor) -> Tensor:
-    """Return the next belief from the gates' pre-activations and the belief, each float32 ``(N, D)``."""
-    candidate = torch.tanh(torch.sigmoid(reset) * candidate)
-    return torch.lerp(belief, candidate, torch.sigmoid(update - UPDATE_SHIFT))
-
-
 def gate_shift() -> Tensor:
     """Return the shifts that are subtracted from reset, candidate and update, ``(3, 1)``."""
     return torch.tensor([[0.0], [0.0], [UPDATE_SHIFT]])
@@ -65,6 +59,15 @@ class GatedUpdate(Function):
         return of_gates.to(ctx.gate_type), None, of_belief
 
 
+def next_belief(gates: Tensor, shift: Tensor, belief: Tensor, few_kernels: bool) -> Tensor:
+    """Return the next belief ``(N, D)``; arguments as of `GatedUpdate`, which ``few_kernels`` uses."""
+    if few_kernels:
+        return GatedUpdate.apply(gates, shift, belief)
+    reset, candidate, update = (gate.flatten(1) for gate in gates.float().unbind(-2))  # (N, D) each
+    candidate = torch.tanh(torch.sigmoid(reset) * candidate)
+    return torch.lerp(belief, candidate, torch.sigmoid(update - UPDATE_SHIFT))
+
+
 class DenseGRUCell(nn.Module):
     """GRU of the 2023 DreamerV3: one dense layer before it, one normalised dense layer for its three gates.
 
@@ -96,10 +99,7 @@ class DenseGRUCell(nn.Module):
         inputs = self.inputs(state, projected_action)
         low = belief.to(inputs.dtype) if low is None else low
         gates = self.gates_norm(self.gates(torch.cat((inputs, low), -1)))
-        if self.few_kernels:
-            return GatedUpdate.apply(gates.unflatten(-1, (1, 3, -1)), self.shift, belief)
-        reset, candidate, update = gates.float().chunk(3, -1)
-        return gated_update(reset, candidate, update, belief)
+        return next_belief(gates.unflatten(-1, (1, 3, -1)), self.shift, belief, self.few_kernels)
 
 
 class BlockGRUCell(nn.Module):
@@ -140,10 +140,5 @@ class BlockGRUCell(nn.Module):
         low = belief if low is None else low
         inputs = torch.cat((self.from_belief(low), self.from_state(state), projected_action), -1)
         hidden = F.silu(self.hidden_norm(self.hidden_shared(inputs) + self.hidden_blocks(low)))
-        # Each block holds its reset, candidate and update gates: (N, 3D) -> three of (N, D)
-        gates = self.gates(hidden)
-        if self.few_kernels:
-            return GatedUpdate.apply(gates.unflatten(-1, (self.blocks, 3, -1)), self.shift, belief)
-        parts = gates.float().unflatten(-1, (self.blocks, 3, -1)).unbind(-2)
-        reset, candidate, update = (gate.flatten(1) for gate in parts)
-        return gated_update(reset, candidate, update, belief)
+        gates = self.gates(hidden).unflatten(-1, (self.blocks, 3, -1))  # (N, 3D) -> (N, G, 3, W)
+        return next_belief(gates, self.shift, belief, self.few_kernels)
