@@ -19,9 +19,11 @@ from dreamer_racing.experience.replay import make_replay
 from dreamer_racing.learners import NetworkSize, PPOConfig, PPOLearner, SACConfig, SACLearner
 from dreamer_racing.learners.baseline import ImageTrunk, ObservationNetwork
 from dreamer_racing.learners.gradient_step import NonFiniteLossError
-from dreamer_racing.modules import Interface
+from dreamer_racing.modules import Interface, symlog
+from dreamer_racing.modules.interface import IMU
 
 SMALL, NUMBERS = NetworkSize(2, 16), Interface(action_dim=1, pixels=False, vector_dim=1)
+SEES_IMU = Interface(vector_dim=6, vector_key=IMU)
 
 
 def make_rollout(
@@ -124,17 +126,19 @@ def test_networks_of_another_size_are_refused(kind: type[PPOLearner | SACLearner
 
 
 @pytest.mark.parametrize(
-    ("there", "words"),
+    ("there", "here", "words"),
     [
-        (Interface(image_size=96), "env.image_size=96, this learner's with 64"),
-        (Interface(pixels=False, vector_dim=21), "env.from_pixels=false, .* with true: set env.from_pixels=false"),
+        (Interface(image_size=96), Interface(), "env.image_size=96, this learner's with 64"),
+        (NUMBERS, Interface(), "env.from_pixels=false, this learner's with true: set env.from_pixels=false"),
+        (Interface(), SEES_IMU, "made without env.imu, and this learner's are made with it"),
+        (SEES_IMU, Interface(), "made with env.imu, and this learner's are made without it"),
     ],
-    ids=["size", "none"],
+    ids=["size", "no images", "no imu", "imu"],
 )
-def test_networks_for_other_images_are_refused(there: Interface, words: str) -> None:
+def test_networks_of_other_observations_are_refused(there: Interface, here: Interface, words: str) -> None:
     saved = PPOLearner(SMALL, there, seed=0).state_dict()
     with pytest.raises(ValueError, match=words):
-        PPOLearner(SMALL, Interface(image_size=64), seed=0).load_state_dict(saved)
+        PPOLearner(SMALL, here, seed=0).load_state_dict(saved)
 
 
 @pytest.mark.parametrize(("minibatches", "steps"), [(1, 1), (7, 7), (48, 48)])
@@ -171,6 +175,14 @@ def test_images_numbers_and_actions_are_read_side_by_side() -> None:
         inputs = [pixels, vector, action]
         inputs[position] = other
         assert not torch.allclose(network(*inputs), outputs), f"input {position} has no influence"
+
+
+def test_an_imu_is_seen_by_its_symlog() -> None:
+    image, sample = torch.zeros(5, 64, 64, 3, dtype=torch.uint8), 20.0 * torch.randn(5, 6)
+    network = ObservationNetwork(SEES_IMU, 2, NetworkSize(0, 8))
+    assert network.in_keys == ["pixels", "imu"]
+    features = torch.cat((network.trunk(image), symlog(sample)), -1)
+    assert torch.equal(network(image, sample), network.mlp(features))
 
 
 def test_images_are_scaled_to_one() -> None:

@@ -177,9 +177,8 @@ def test_an_objective_is_found_by_its_name_or_in_a_module_of_ones_own(tmp_path, 
 def test_an_objective_that_is_not_found_says_where_it_was_looked_for_and_what_to_set(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("PYTHONPATH", "/somewhere")
-    with pytest.raises(ValueError, match=rf"there is no nowhere\.py in {tmp_path}, nor on PYTHONPATH \(/somewhere\)"):
-        find_objective("nowhere:mine")
-    with pytest.raises(ValueError, match="set PYTHONPATH to that folder"):
+    searched = rf"there is no nowhere\.py in {tmp_path}, nor on PYTHONPATH \(/somewhere\)"
+    with pytest.raises(ValueError, match=f"{searched}.* set PYTHONPATH to that folder"):
         find_objective("nowhere:mine")
     (tmp_path / "imports_nothing.py").write_text("import that_is_not_there\n")
     with pytest.raises(ValueError, match="cannot be imported: No module named 'that_is_not_there'"):

@@ -259,13 +259,10 @@ def test_the_representation_learns_at_a_tenth_of_the_rate_of_the_dynamics():
     torch.testing.assert_close(losses["loss_reward"].item(), math.log(255))
 
 
-@pytest.mark.parametrize("name", ["privileged", "informed"])
-def test_no_privileged_numbers_is_an_error_that_says_what_to_do(name):
-    with pytest.raises(ValueError, match=r"target State needs privileged numbers.*privileged=True"):
-        learner_of(world_model=name)
-
-
-def test_reconstruction_without_decoders_is_an_error_that_says_what_to_do():
+def test_what_a_target_lacks_is_an_error_that_says_what_to_do():
+    for name in ("privileged", "informed"):
+        with pytest.raises(ValueError, match=r"target State needs privileged numbers.*privileged=True"):
+            learner_of(world_model=name)
     agent = Agent(SIZES["debug"], Interface(), decode=False)
     with pytest.raises(ValueError, match=r"'reconstruction' needs a world model with decoders: Agent\(\.\.\., decode"):
         WorldModelLoss(agent, LossConfig())

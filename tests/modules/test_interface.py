@@ -13,7 +13,6 @@ from torchrl.envs import EnvBase, InitTracker, TransformedEnv
 
 from dreamer_racing.envs import DroneRacingEnv
 from dreamer_racing.envs.simulator.scene import Camera
-from dreamer_racing.learners.baseline import NetworkSize, ObservationNetwork, check_layers, layers_of
 from dreamer_racing.modules import (
     SIZES,
     DreamerPolicy,
@@ -26,7 +25,6 @@ from dreamer_racing.modules import (
     get_size,
 )
 from dreamer_racing.modules.agent import Agent
-from dreamer_racing.modules.heads import symlog
 from dreamer_racing.modules.interface import IMU, PIXELS, PRIVILEGED
 from tests.dreamers import make_windows
 
@@ -218,39 +216,14 @@ def test_policy_of_an_agent_that_sees_numbers_asks_for_no_images():
     assert keys == ["vector", "is_init", "belief", "state", "previous_action"]
 
 
-# Networks that see what an IMU tells beside images: the world model's, and the baselines'.
-
-
-SEEN = Interface(image_size=32, vector_dim=6, vector_key=IMU)
-
-
 def test_the_world_model_reads_both_and_decodes_both() -> None:
     torch.manual_seed(0)
-    model = WorldModel(get_size("debug"), SEEN)
+    model = WorldModel(get_size("debug"), Interface(image_size=32, vector_dim=6, vector_key=IMU))
     assert model.encoder.keys == [PIXELS, IMU]
     assert model.vector_decoder is not None
     seen = {PIXELS: torch.zeros(2, 3, 32, 32, 3, dtype=torch.uint8), IMU: torch.randn(2, 3, 6)}
     embedding = model.encoder(seen)
     assert not torch.equal(embedding, model.encoder({**seen, IMU: seen[IMU] + 1.0}))
-
-
-def test_baselines_see_its_symlog() -> None:
-    torch.manual_seed(0)
-    image, sample = torch.zeros(5, 36, 36, 3, dtype=torch.uint8), 20.0 * torch.randn(5, 6)
-    network = ObservationNetwork(Interface(image_size=36, vector_dim=6, vector_key=IMU), 2, NetworkSize(0, 8))
-    assert network.in_keys == [PIXELS, IMU]
-    assert network.trunk is not None
-    features = torch.cat((network.trunk(image), symlog(sample)), -1)
-    assert torch.equal(network(image, sample), network.mlp(features))
-
-
-def test_a_checkpoint_without_an_imu_is_refused_by_networks_with_one() -> None:
-    without, with_one = (layers_of(NetworkSize(), seen) for seen in (Interface(image_size=32), SEEN))
-    check_layers(without, without)
-    with pytest.raises(ValueError, match="made without env.imu, and this learner's are made with it"):
-        check_layers(without, with_one)
-    with pytest.raises(ValueError, match="made with env.imu, and this learner's are made without it"):
-        check_layers(with_one, without)
 
 
 # Parameters in millions, counted in other implementations of the same architectures.
