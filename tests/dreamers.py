@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import functools
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import torch
@@ -71,6 +71,12 @@ def make_windows(
     numbers = {key: torch.randn(*shape, width, generator=generator) for key, width in widths.items() if width}
     action = torch.rand(*shape, 4, generator=generator) * 2 - 1
     return TensorDict({"pixels": images, "previous_action": action, **numbers, **flags}, shape)
+
+
+def differing(found: Mapping[str, Tensor], expected: Mapping[str, Tensor]) -> set[str]:
+    """Names of tensors that are not the same in both, or that only one has."""
+    both = found.keys() & expected.keys()
+    return (found.keys() ^ expected.keys()) | {name for name in both if not torch.equal(found[name], expected[name])}
 
 
 def rssm_of(**numbers: Any) -> RSSM:

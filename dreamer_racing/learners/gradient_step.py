@@ -75,7 +75,8 @@ class FiniteGuard:
             for name, value in metrics.items()
             if name in ("loss", "reward_error") or name.startswith("gradient_norm/")
         ]
-        finite, copied = torch.stack(watched).isfinite().all(), None
+        finite = torch.stack(watched).isfinite().all()
+        copied: torch.cuda.Event | None = None
         if finite.is_cuda:  # copied asynchronously, so that reading it does not wait for later kernels
             stream, copied = torch.cuda.current_stream(finite.device), torch.cuda.Event()
             finite = finite.to("cpu", non_blocking=True)

@@ -21,6 +21,7 @@ from dreamer_racing.learners.baseline import ImageTrunk, ObservationNetwork
 from dreamer_racing.learners.gradient_step import NonFiniteLossError
 from dreamer_racing.modules import Interface, symlog
 from dreamer_racing.modules.interface import IMU
+from tests.dreamers import differing
 
 SMALL, NUMBERS = NetworkSize(2, 16), Interface(action_dim=1, pixels=False, vector_dim=1)
 SEES_IMU = Interface(vector_dim=6, vector_key=IMU)
@@ -311,8 +312,7 @@ def test_a_restored_learner_goes_on_as_the_one_that_was_saved(
     for each in (learner, other):
         torch.manual_seed(1)
         metrics.append(each.update(make_batch()))
-    assert metrics[0].keys() == metrics[1].keys()
-    assert all(torch.equal(metrics[0][name], metrics[1][name]) for name in metrics[0])
+    assert not differing(*metrics)
     seen = make_batch().select("vector")
     actions = [each.policy(deterministic=True)(seen.clone())["action"] for each in (learner, other)]
     assert torch.equal(*actions)

@@ -25,7 +25,7 @@ from dreamer_racing.learners.dreamer_v3 import DreamerV3
 from dreamer_racing.learners.update import WorldModelLearner
 from dreamer_racing.losses import TARGETS, Trajectory
 from dreamer_racing.modules import Interface, get_size
-from tests.dreamers import learner_by, learner_of, make_windows
+from tests.dreamers import differing, learner_by, learner_of, make_windows
 from tests.launches import Launches, launches
 
 
@@ -71,8 +71,7 @@ def test_after_the_capture_a_learner_is_measured_saved_and_flown(tmp_path: Path)
     assert all(value.isfinite() for value in metrics.values())
     torch.save(learner.state_dict(), tmp_path / "learner.pt")
     other.load_state_dict(torch.load(tmp_path / "learner.pt", weights_only=False))
-    for name, value in before.items():
-        assert torch.equal(value, other.agent.state_dict()[name]), name
+    assert not differing(other.agent.state_dict(), before)
     course = Course(learner.evaluation_policy(), {"track": "circle", "device": "cuda"}, 2)
     assert len(course.evaluate().episodes) == 2
     course.close()

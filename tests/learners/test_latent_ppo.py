@@ -18,7 +18,7 @@ from dreamer_racing.learners.latent_ppo import LatentPPO, PPOUpdate
 from dreamer_racing.losses import PPOUpdateConfig, rollout_return
 from dreamer_racing.modules import Interface, join_features
 from dreamer_racing.modules.heads import ActionDistribution, symlog
-from tests.dreamers import latent_ppo_of
+from tests.dreamers import differing, latent_ppo_of
 from tests.launches import launches
 from tests.learners.test_dreamer_v3 import make_batch, watch
 
@@ -69,8 +69,7 @@ def test_an_update_of_the_actor_moves_actor_and_its_critic_and_nothing_else(crit
     collect(learner)
     metrics = learner.update_actor()
     for name, part in (parts | others).items():
-        moved = any(not torch.equal(value, before[name][key]) for key, value in part.state_dict().items())
-        assert moved == (name in parts), name
+        assert bool(differing(part.state_dict(), before[name])) == (name in parts), name
     assert set(metrics) == {
         "ppo/loss", "ppo/kl", "ppo/clipped", "ppo/epochs", "ppo/learning_rate_scale", "ppo/critic_loss",
         "ppo/explained_variance", "entropy", "gradient_norm/actor", "gradient_norm/own_critic",
@@ -90,7 +89,7 @@ def test_the_actor_stands_still_until_enough_was_collected_and_while_it_waits():
     learner.actor_waits = True
     before = copy.deepcopy(learner.agent.state_dict())
     assert "ppo/kl" not in learner.update(batch)
-    moved = {name for name, value in learner.agent.state_dict().items() if not torch.equal(value, before[name])}
+    moved = differing(learner.agent.state_dict(), before)
     assert any(name.startswith("world_model.") for name in moved)
     assert not any(name.startswith("actor.") for name in moved)
     learner.actor_waits = False
@@ -121,9 +120,8 @@ def test_a_checkpoint_between_two_updates_of_the_actor_loses_nothing(critic):
         torch.manual_seed(5)
         each.collect(rollouts[3])
         assert "ppo/kl" in each.update(batch)
-    for part in (lambda it: it.agent.state_dict(), lambda it: it.critic.state_dict()):
-        for (name, value), other in zip(part(learner).items(), part(resumed).values(), strict=True):
-            assert torch.equal(value, other), name
+    assert not differing(learner.agent.state_dict(), resumed.agent.state_dict())
+    assert not differing(learner.critic.state_dict(), resumed.critic.state_dict())
 
 
 @of_each
