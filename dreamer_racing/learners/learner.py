@@ -31,11 +31,9 @@ class Policy(Protocol):
 
     def __call__(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Write the action and the policy's recurrent state."""
-        ...
 
     def make_primer(self) -> Transform:
         """Make the transform that adds the policy's recurrent state to an environment; an empty ``Compose`` if none."""
-        ...
 
 
 class Evaluable(Protocol):
@@ -46,11 +44,9 @@ class Evaluable(Protocol):
 
     def evaluation_policy(self) -> Policy:
         """Return the policy to evaluate, which may have averaged weights."""
-        ...
 
     def value_function(self) -> ValueFunction | None:
         """Return the value function of the critic that the actor learns from; None without one."""
-        ...
 
 
 class Learner(Evaluable, Protocol):
@@ -61,23 +57,18 @@ class Learner(Evaluable, Protocol):
 
     def policy(self) -> Policy:
         """Return the policy that is trained, which shares the learner's parameters."""
-        ...
 
     def update(self, batch: TensorDictBase, /, timed: Timer = ...) -> dict[str, Tensor]:
         """Learn from replayed records or a rollout; return losses and metrics, scalar tensors by their names."""
-        ...
 
     def check_finite(self) -> None:
         """Raise ``NonFiniteLossError`` if an update was not finite."""
-        ...
 
     def state_dict(self) -> dict[str, Any]:
         """Return everything that the next update depends on, except the global random generators."""
-        ...
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
         """Restore what ``state_dict`` returned."""
-        ...
 
 
 @dataclass
