@@ -21,9 +21,8 @@ from torch import Tensor
 
 from dreamer_racing.envs.drone.parameters import load_preset, without_randomisation
 from dreamer_racing.envs.race.pilot import ScriptedPilot
-from dreamer_racing.envs.simulator.mujoco_cpu import MujocoSimulator, Simulator
-from dreamer_racing.envs.simulator.mujoco_warp import WarpSimulator
 from dreamer_racing.envs.simulator.rendering import RENDERERS
+from dreamer_racing.envs.simulator.simulators import MujocoSimulator, Simulator, WarpSimulator
 from dreamer_racing.envs.tracks import PLAIN_TRACKS, load_track
 from dreamer_racing.envs.worlds import RaceWorlds
 

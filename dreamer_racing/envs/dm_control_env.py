@@ -44,7 +44,6 @@ from dreamer_racing.envs.own import CustomFunction, RaceState, RewardFunction, T
 from dreamer_racing.envs.race.race import EPISODE_TIME, EVALUATION_TIME, Race, RaceStep, RaceVector, RewardWeights
 from dreamer_racing.envs.race.starts import StartSampler
 from dreamer_racing.envs.simulator.fused_flight import FusedFlight
-from dreamer_racing.envs.simulator.mujoco_cpu import DroneState
 from dreamer_racing.envs.simulator.scene import (
     CAMERA_NAME,
     HALL_GROUP,
@@ -53,6 +52,7 @@ from dreamer_racing.envs.simulator.scene import (
     frame_interval,
     load_camera,
 )
+from dreamer_racing.envs.simulator.simulators import DroneState
 from dreamer_racing.envs.tracks import Track, load_track
 from dreamer_racing.envs.worlds import ACTION_SIZE, check_action
 from dreamer_racing.settings import check_flags, check_numbers, without_none

@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 
 from dreamer_racing.envs.race.race import Race, RaceStep, RaceVector
-from dreamer_racing.envs.simulator.mujoco_cpu import DroneState
+from dreamer_racing.envs.simulator.simulators import DroneState
 from dreamer_racing.settings import import_own, quoted
 
 

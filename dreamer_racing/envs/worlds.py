@@ -33,10 +33,9 @@ from dreamer_racing.envs.race.race import (
 )
 from dreamer_racing.envs.race.racing_line import START_LINE, plan_racing_line
 from dreamer_racing.envs.race.starts import StartSampler
-from dreamer_racing.envs.simulator.backends import check_device, make_simulator
 from dreamer_racing.envs.simulator.looks import LooksRandomisation, load_looks
-from dreamer_racing.envs.simulator.mujoco_cpu import Simulator
 from dreamer_racing.envs.simulator.scene import Camera, frame_interval, load_camera
+from dreamer_racing.envs.simulator.simulators import Simulator, check_device, make_simulator
 from dreamer_racing.envs.simulator.warp_device import GraphedFunction
 from dreamer_racing.envs.tracks import Track, load_track
 from dreamer_racing.machine import is_out_of_memory

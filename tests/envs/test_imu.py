@@ -15,8 +15,8 @@ from torchrl.envs.utils import check_env_specs
 from dreamer_racing.envs.dm_control_env import load
 from dreamer_racing.envs.drone.parameters import GRAVITY, PRESETS, QuadrotorParameters
 from dreamer_racing.envs.imu import ACCELEROMETER_RANGE, IMUS, Imu, ImuErrors
-from dreamer_racing.envs.simulator.mujoco_cpu import MujocoSimulator
 from dreamer_racing.envs.simulator.scene import Camera
+from dreamer_racing.envs.simulator.simulators import MujocoSimulator
 from dreamer_racing.envs.torchrl_env import DroneRacingEnv
 from dreamer_racing.envs.tracks import load_track
 from dreamer_racing.envs.worlds import RaceWorlds

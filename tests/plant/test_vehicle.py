@@ -10,7 +10,7 @@ import torch
 
 from dreamer_racing.envs.drone.parameters import GRAVITY, PRESETS, without_randomisation
 from dreamer_racing.envs.race.gates import CrashCause
-from dreamer_racing.envs.simulator.mujoco_cpu import MujocoSimulator
+from dreamer_racing.envs.simulator.simulators import MujocoSimulator
 from dreamer_racing.envs.tracks import load_track
 from dreamer_racing.hil.flyer import Flyer
 from dreamer_racing.hil.vehicle import Command, Setpoint, at_rest, hover

@@ -17,7 +17,7 @@ from torch import Tensor
 
 from dreamer_racing.envs.drone.rotation import align, rotate, rotate_inverse
 from dreamer_racing.envs.race.gates import CrashCause, GateSweeper
-from dreamer_racing.envs.simulator.mujoco_cpu import DroneState
+from dreamer_racing.envs.simulator.simulators import DroneState
 from dreamer_racing.envs.tracks import Track
 from dreamer_racing.settings import FINITE, check_settings, quoted, setting
 

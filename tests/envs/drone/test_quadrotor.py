@@ -17,8 +17,8 @@ from torch import Tensor
 from dreamer_racing.envs.drone.parameters import GRAVITY, PRESETS, QuadrotorParameters, Randomisation, load_preset
 from dreamer_racing.envs.drone.quadrotor import Quadrotor
 from dreamer_racing.envs.simulator.fused_flight import FusedFlight
-from dreamer_racing.envs.simulator.mujoco_cpu import MujocoSimulator
 from dreamer_racing.envs.simulator.scene import build_drone
+from dreamer_racing.envs.simulator.simulators import MujocoSimulator
 from dreamer_racing.envs.tracks import load_track
 from tests.torch_flight import TorchFlight, effectiveness, mix, wrench
 

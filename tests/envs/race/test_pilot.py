@@ -6,8 +6,7 @@ import torch
 from dreamer_racing.envs.drone.parameters import PRESETS
 from dreamer_racing.envs.race import racing_line
 from dreamer_racing.envs.race.gates import CrashCause
-from dreamer_racing.envs.race.pilot import PilotPolicy, ScriptedPilot
-from dreamer_racing.envs.race.pilot_evaluation import evaluate_pilot
+from dreamer_racing.envs.race.pilot import PilotPolicy, ScriptedPilot, evaluate_pilot
 from dreamer_racing.envs.race.racing_line import (
     START_LINE,
     Dynamics,

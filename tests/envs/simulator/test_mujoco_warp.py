@@ -12,12 +12,11 @@ from torchrl.envs.utils import check_env_specs
 from dreamer_racing.envs import DroneRacingEnv
 from dreamer_racing.envs.drone.parameters import PRESETS
 from dreamer_racing.envs.race.starts import StartSampler
-from dreamer_racing.envs.simulator import mujoco_warp
+from dreamer_racing.envs.simulator import simulators
 from dreamer_racing.envs.simulator.looks import load_looks
-from dreamer_racing.envs.simulator.mujoco_cpu import MujocoSimulator
-from dreamer_racing.envs.simulator.mujoco_warp import WarpSimulator, memory_of_worlds
 from dreamer_racing.envs.simulator.opengl import RendererUnavailableError
 from dreamer_racing.envs.simulator.scene import Camera
+from dreamer_racing.envs.simulator.simulators import MujocoSimulator, WarpSimulator, memory_of_worlds
 from dreamer_racing.envs.simulator.warp_device import load_warp
 from dreamer_racing.envs.tracks import load_track
 from dreamer_racing.envs.worlds import RaceWorlds
@@ -205,8 +204,8 @@ def test_what_the_backend_lacks_is_refused_by_name(arguments: dict[str, object],
 
 
 def test_too_many_worlds_are_refused_before_anything_is_allocated(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(mujoco_warp, "available_memory", lambda device: 1e9)
-    monkeypatch.setattr(mujoco_warp, "_make_bodies", lambda *arguments: pytest.fail("allocated"))
+    monkeypatch.setattr(simulators, "available_memory", lambda device: 1e9)
+    monkeypatch.setattr(simulators, "_make_bodies", lambda *arguments: pytest.fail("allocated"))
     with pytest.raises(ValueError, match=r"num_envs=100,000 needs about 5.0 GB, and cpu has 1.0 GB left: at most"):
         RaceWorlds("kidney", 100_000, backend="mujoco_warp")
 

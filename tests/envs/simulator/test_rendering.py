@@ -16,9 +16,9 @@ from PIL import Image
 
 from dreamer_racing.envs.drone.parameters import PRESETS
 from dreamer_racing.envs.drone.rotation import from_roll_pitch_yaw
-from dreamer_racing.envs.simulator.mujoco_cpu import MujocoSimulator
 from dreamer_racing.envs.simulator.rendering import Renderer, RenderThread
 from dreamer_racing.envs.simulator.scene import Camera
+from dreamer_racing.envs.simulator.simulators import MujocoSimulator
 from dreamer_racing.envs.tracks import load_track
 from tests.renderers import IN_PROCESS, renderer_or_skip
 

@@ -18,10 +18,10 @@ from dreamer_racing import machine
 from dreamer_racing.envs.drone.parameters import PRESETS
 from dreamer_racing.envs.drone.quadrotor import Quadrotor
 from dreamer_racing.envs.drone.rotation import from_roll_pitch_yaw
-from dreamer_racing.envs.simulator import mujoco_cpu, opengl, rendering
-from dreamer_racing.envs.simulator.mujoco_cpu import MujocoSimulator
+from dreamer_racing.envs.simulator import opengl, rendering, simulators
 from dreamer_racing.envs.simulator.opengl import RendererUnavailableError
 from dreamer_racing.envs.simulator.scene import DRONE_GROUP, Camera, build_scene
+from dreamer_racing.envs.simulator.simulators import MujocoSimulator
 from dreamer_racing.envs.tracks import load_track
 from tests.renderers import IN_PROCESS, renderer_or_skip
 from tests.torch_flight import TorchFlight
@@ -63,11 +63,11 @@ def snapshot(made: MujocoSimulator) -> Tensor:
 @pytest.mark.parametrize(("num_envs", "num_threads", "expected"), [(5, None, 2), (5, 3, 3), (1, None, 1), (1, 3, 1)])
 def test_threads_of_physics_and_drawing(num_envs: int, num_threads: int | None, expected: int, monkeypatch) -> None:
     """One a CPU, at most OMP_NUM_THREADS; as many as are asked for; never more than worlds."""
-    seen, make_batch = [], mujoco_cpu.Batch
+    seen, make_batch = [], simulators.Batch
     monkeypatch.setattr(machine, "available_cpus", lambda: 4)
     monkeypatch.setenv("OMP_NUM_THREADS", "2")
-    monkeypatch.setattr(mujoco_cpu, "Batch", lambda *given: seen.append(given[2]) or make_batch(*given))
-    monkeypatch.setattr(mujoco_cpu, "make_renderer", lambda *given: seen.append(given[4]))
+    monkeypatch.setattr(simulators, "Batch", lambda *given: seen.append(given[2]) or make_batch(*given))
+    monkeypatch.setattr(simulators, "make_renderer", lambda *given: seen.append(given[4]))
     MujocoSimulator(KIDNEY, EASY, num_envs, num_threads=num_threads)
     assert seen == [expected, expected]
 
@@ -252,7 +252,7 @@ def test_drone_does_not_see_itself(renderer: str, monkeypatch: pytest.MonkeyPatc
     for geom in list(bare.body("drone").geoms):
         assert geom.group == DRONE_GROUP
         bare.delete(geom)
-    monkeypatch.setattr("dreamer_racing.envs.simulator.mujoco_cpu.build_scene", lambda *arguments: bare)
+    monkeypatch.setattr("dreamer_racing.envs.simulator.simulators.build_scene", lambda *arguments: bare)
     assert torch.equal(drawn, images(renderer, start, camera=camera))
 
 

@@ -1,4 +1,4 @@
-"""`Simulator`, N worlds with one drone each, and its CPU backend: MuJoCo's C engine with native batching.
+"""`Simulator`, N worlds with one drone each; its backends are MuJoCo's C engine on CPU and `mujoco_warp` on CUDA.
 
 Shapes: N worlds, P physics steps per control step. SI units, attitude wxyz.
 """
@@ -7,7 +7,8 @@ import ctypes
 import os
 import weakref
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, fields, is_dataclass
+from functools import partial
 from typing import Any
 
 import mujoco
@@ -19,11 +20,13 @@ from dreamer_racing.envs.drone.parameters import QuadrotorParameters
 from dreamer_racing.envs.drone.quadrotor import Quadrotor
 from dreamer_racing.envs.simulator.fused_flight import FusedFlight
 from dreamer_racing.envs.simulator.looks import LooksRandomisation, LooksSampler
-from dreamer_racing.envs.simulator.ray_caster import RayCaster
-from dreamer_racing.envs.simulator.rendering import Renderer, make_renderer
+from dreamer_racing.envs.simulator.rendering import RayCaster, Renderer, make_renderer
 from dreamer_racing.envs.simulator.scene import Camera, build_drone, build_scene
+from dreamer_racing.envs.simulator.warp_device import load_warp, scope
 from dreamer_racing.envs.tracks import Track
-from dreamer_racing.machine import usable_threads
+from dreamer_racing.machine import GB, available_memory, usable_threads
+
+BACKENDS = ("mujoco", "mujoco_warp")
 
 
 @dataclass(frozen=True)
@@ -204,3 +207,170 @@ class MujocoSimulator(Simulator):
             self.renderer = make_renderer(renderer, scene, camera, num_envs, num_threads, looks is not None)
             if looks is not None:
                 self.looks = LooksSampler(looks, scene, camera, num_envs, self.device, self.dtype, generator)
+
+
+class WarpSimulator(Simulator):
+    """Simulator with `mujoco_warp`'s physics, in float32, and its ray caster. On CPU it is slow, for tests only.
+
+    Neither a step nor rendering all worlds synchronises with the device.
+
+    Args:
+        images: whether to render images.
+        generator: source of the randomisation of physics and looks, on the device.
+        looks: randomisation of looks; None for the same in every episode.
+
+    Raises:
+        ValueError: the device does not have enough memory for so many worlds.
+
+    Example:
+        >>> from dreamer_racing.envs.tracks import load_track
+        >>> simulator = WarpSimulator(load_track("kidney"), QuadrotorParameters(), 4, images=False, device="cpu")
+        >>> simulator.step(torch.zeros(4, 4)).shape
+        torch.Size([11, 4, 3])
+    """
+
+    def __init__(
+        self,
+        track: Track,
+        parameters: QuadrotorParameters,
+        num_envs: int,
+        camera: Camera | None = None,
+        images: bool = True,
+        device: torch.device | str = "cuda",
+        generator: torch.Generator | None = None,
+        looks: LooksRandomisation | None = None,
+    ) -> None:
+        warp, device = load_warp(), torch.device(device)
+        _check_memory(memory_of_worlds(track, parameters, num_envs, camera, images), num_envs, device)
+        data, integrate = _make_bodies(parameters, num_envs, device)
+        qpos, qvel, force = (warp.to_torch(array) for array in (data.qpos, data.qvel, data.qfrc_applied))
+        super().__init__(parameters, qpos, qvel, force, integrate, generator)
+        if images:
+            camera = camera or Camera()
+            scene = build_scene(track, parameters, camera).compile()
+            self.renderer = RayCaster(scene, camera, num_envs, device, looks is not None)
+            if looks is not None:
+                self.looks = LooksSampler(looks, scene, camera, num_envs, device, self.dtype, generator)
+
+    def step(self, action: Tensor) -> Tensor:
+        """Simulate one control step on torch's current stream; see `Simulator.step`."""
+        with scope(self.device):
+            return super().step(action)
+
+
+def _make_bodies(
+    parameters: QuadrotorParameters, num_envs: int, device: torch.device
+) -> tuple[Any, Callable[[], None]]:
+    """Make N drones in empty worlds; return their data and a function that makes one physics step, in a `scope`."""
+    load_warp()
+    import mujoco_warp
+
+    drone = build_drone(parameters).compile()
+    with scope(device):
+        model, data = mujoco_warp.put_model(drone), _make_data(drone, num_envs)
+
+    return data, partial(mujoco_warp.step, model, data)
+
+
+def _check_memory(needed: int, num_envs: int, device: torch.device) -> None:
+    available = available_memory(device)
+    if needed > available:
+        raise ValueError(
+            f"num_envs={num_envs:,} needs about {needed / GB:.1f} GB, and {device} has {available / GB:.1f} GB left: "
+            f"at most about {int(num_envs * available / needed):,} worlds fit."
+        )
+
+
+def _make_data(model: mujoco.MjModel, num_worlds: int) -> Any:
+    """Make the data of worlds without room for contacts or constraints, so that MuJoCo does not run its solver."""
+    import mujoco_warp
+
+    return mujoco_warp.make_data(model, nworld=num_worlds, nconmax=0, njmax=0)
+
+
+def memory_of_worlds(
+    track: Track, parameters: QuadrotorParameters, num_envs: int, camera: Camera | None = None, images: bool = True
+) -> int:
+    """Estimate the device memory of a `WarpSimulator` and one observation of its N worlds, in bytes.
+
+    It adds up the arrays of one world. The nodes of the bounding volumes, which warp does not expose, are assumed to
+    be two per geom, of 64 bytes.
+    """
+    models = [build_drone(parameters).compile()]
+    per_world = 4 * 3 * (parameters.physics_steps + 1)  # positions of all physics steps
+    if images:
+        camera = camera or Camera()
+        hall = build_scene(track, parameters, camera).compile()
+        models.append(hall)
+        pixels = camera.width * camera.height
+        per_world += pixels * (4 + 2 * 3) + hall.ngeom * (28 + 2 * 64)  # packed; rendered and copied; bounding volumes
+    with scope(torch.device("cpu")):
+        per_world += sum(_array_bytes(_make_data(model, 2)) - _array_bytes(_make_data(model, 1)) for model in models)
+    return per_world * num_envs
+
+
+def _array_bytes(data: Any) -> int:
+    """Return the bytes of all warp arrays of a (nested) dataclass."""
+    total = 0
+    for field in fields(data):
+        value = getattr(data, field.name)
+        if is_dataclass(value):
+            total += _array_bytes(value)
+        else:
+            total += getattr(value, "capacity", 0)
+    return total
+
+
+def check_device(device: torch.device | str) -> None:
+    """Refuse a device that does not exist or is not supported.
+
+    Raises:
+        ValueError: the message says what is available.
+    """
+    if str(device).partition(":")[0] not in ("cpu", "cuda"):
+        raise ValueError(f"device={str(device)!r}: must be cpu or cuda.")
+    device = torch.device(device)
+    if device.type == "cpu":
+        return
+    if not torch.cuda.is_available():
+        build = f"for CUDA {torch.version.cuda}" if torch.version.cuda else "without CUDA"
+        raise ValueError(
+            f"device={str(device)!r}: torch {torch.__version__}, built {build}, finds no CUDA device here. Use "
+            "device='cpu', or install a torch build for CUDA and NVIDIA's driver."
+        )
+    if (device.index or 0) >= torch.cuda.device_count():
+        raise ValueError(f"device={str(device)!r}: there are {torch.cuda.device_count()} CUDA device(s), from cuda:0.")
+
+
+def make_simulator(
+    track: Track,
+    parameters: QuadrotorParameters,
+    num_envs: int,
+    camera: Camera,
+    renderer: str | None,
+    num_threads: int | None,
+    generator: torch.Generator,
+    device: torch.device | str,
+    backend: str = "auto",
+    looks: LooksRandomisation | None = None,
+) -> Simulator:
+    """Make the simulator of a backend; `auto` chooses by device. Arguments: `RaceWorlds`; renderer=None: no images.
+
+    Raises:
+        ValueError: unknown backend, or one that does not support the device or renderer.
+    """
+    device = torch.device(device)
+    if backend == "auto":
+        backend = "mujoco" if device.type == "cpu" else "mujoco_warp"
+    if backend not in BACKENDS:
+        raise ValueError(f"Unknown backend {backend!r}: use auto, {', '.join(BACKENDS)}.")
+    if backend == "mujoco":
+        if device.type != "cpu":
+            raise ValueError(f"backend='mujoco' runs on cpu, not on {str(device)!r}: set one or the other.")
+        return MujocoSimulator(track, parameters, num_envs, camera, renderer, num_threads, generator, looks)
+    if renderer not in (None, "auto", "warp"):
+        raise ValueError(
+            f"renderer={renderer!r} is for backend 'mujoco'. The backend on {str(device)!r} is 'mujoco_warp', which "
+            "has its own renderer: use renderer='auto' or 'warp'."
+        )
+    return WarpSimulator(track, parameters, num_envs, camera, renderer is not None, device, generator, looks)
