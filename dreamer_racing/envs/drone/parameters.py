@@ -29,10 +29,10 @@ from dreamer_racing.settings import (
 
 T = TypeVar("T")
 GRAVITY = 9.81  # m/s²
+# MuJoCo's names of the allowed integrators: `FusedFlight` corrects Euler to second order; RK4 needs no correction
 INTEGRATORS = ("Euler", "RK4")
-"""MuJoCo's names of the allowed integrators: `FusedFlight` corrects Euler to second order; RK4 needs no correction."""
+# quantity with first-order lag to its target: a rotor's speed, or its thrust, which is the square of the speed
 MOTOR_LAGS = ("speed", "thrust")
-"""Quantity with first-order lag to its target: a rotor's speed, or its thrust, which is the square of the speed."""
 
 
 @dataclass(frozen=True)
@@ -156,9 +156,7 @@ PRESETS: dict[str, QuadrotorParameters] = {
     ),
 }
 
-
-SUFFIXES = (".yaml", ".yml")
-"""File name suffixes of drone files."""
+SUFFIXES = (".yaml", ".yml")  # of drone files
 
 
 def load_preset(preset: str | QuadrotorParameters) -> QuadrotorParameters:
@@ -220,12 +218,9 @@ def _with_changes(base: T, changes: Mapping[str, Any]) -> T:
 
 
 def save_drone(path: Path, drone: QuadrotorParameters, about: Mapping[str, Any]) -> None:
-    """Write a drone to a file that `load_preset` reads, as differences from the preset `faithful` or `betaflight`.
+    """Write a drone to a .yaml file for `load_preset`, as differences from the preset `faithful` or `betaflight`.
 
-    Args:
-        path: The .yaml file; an existing one is replaced.
-        drone: The drone; its randomisation is not written.
-        about: Sources of its numbers, plain values.
+    An existing file is replaced. The randomisation is not written; ``about`` are the numbers' sources, plain values.
     """
     base = "faithful" if drone.betaflight is None else "betaflight"
     content = {"preset": base, "parameters": _differences(PRESETS[base], drone), "about": dict(about)}
@@ -244,8 +239,7 @@ def _differences(base: Any, changed: Any) -> dict[str, Any]:
     return found
 
 
-MIN_CONTROL_RATE = 10.0
-"""Lowest control rate, Hz, at which a drone at 18 m/s flies 1.8 m per step [choice]."""
+MIN_CONTROL_RATE = 10.0  # Hz, at which a drone at 18 m/s flies 1.8 m per step [choice]
 
 
 def at_control_rate(parameters: QuadrotorParameters, rate: float | None) -> QuadrotorParameters:

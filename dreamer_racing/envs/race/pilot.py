@@ -298,16 +298,10 @@ def evaluate_pilot(
     random_starts: bool = False,
     seed: int = 0,
 ) -> PilotStatistics:
-    """Fly N complete episodes and return their statistics.
+    """Fly N complete episodes of L laps and return their statistics.
 
-    Args:
-        track: name, path or `Track`.
-        preset: physics preset or parameters.
-        num_envs: N.
-        laps: L.
-        pilot: the pilot; a `ScriptedPilot` with default limits if None.
-        random_starts: start as in training, instead of at the start pose.
-        seed: seed of randomisation and starts.
+    The pilot is a `ScriptedPilot` with default limits if None. With ``random_starts`` episodes start as in training,
+    instead of at the start pose. The seed is of randomisation and starts.
     """
     parameters = load_preset(preset)
     worlds = RaceWorlds(

@@ -34,27 +34,20 @@ STORED = Path(__file__).with_name("racing_lines.npz")
 class LineLimits:
     """Limits of the racing line."""
 
+    # largest fraction of the maximum collective thrust that the line may use; sets the aggressiveness. 0.9 leaves a
+    # margin for corrections and for randomised drones with 14 % less thrust; above 0.95 the laps get no faster
     speed: float = 0.9
-    """Largest fraction of the maximum collective thrust that the line may use; sets the aggressiveness. 0.9 leaves a
-    margin for corrections and for randomised drones with 14 % less thrust; above 0.95 the laps get no faster."""
-    gate_offset: float = 0.25
-    """Maximum distance from a gate's centre to the left and up, m; at most 40 % of the half opening."""
-    body_rate_max: float = 6.0
-    """Maximum roll and pitch rate, rad/s."""
-    angular_acceleration_max: float = 40.0
-    """Maximum roll and pitch acceleration, rad/s²."""
-    thrust_min: float = 4.0
-    """Minimum collective thrust, m/s²; near zero thrust the attitude is undefined."""
-    gate_cosine: float = 0.75
-    """Minimum cosine of the angle between the velocity and a gate's normal."""
-    clearance: float = 0.5
-    """Minimum distance from the bounding box, m."""
-    height_min: float = 0.6
-    """Minimum height, m."""
+    gate_offset: float = 0.25  # m, at most, from a gate's centre to the left and up; at most 40 % of the half opening
+    body_rate_max: float = 6.0  # rad/s, of roll and pitch
+    angular_acceleration_max: float = 40.0  # rad/s², of roll and pitch
+    thrust_min: float = 4.0  # m/s², collective; near zero thrust the attitude is undefined
+    gate_cosine: float = 0.75  # at least, of the angle between the velocity and a gate's normal
+    clearance: float = 0.5  # m, at least, from the bounding box
+    height_min: float = 0.6  # m
 
 
+# of the line on which training episodes begin: slow enough to fly on from a noisy start
 START_LINE = LineLimits(speed=0.7)
-"""Limits of the line on which training episodes begin: slow enough to fly on from a noisy start."""
 
 
 @dataclass(frozen=True)
@@ -247,15 +240,9 @@ def _lap_cost(
 
 @lru_cache(maxsize=32)
 def plan_racing_line(track: Track, parameters: QuadrotorParameters, limits: LineLimits) -> RacingLine:
-    """Plan a fast closed line through all gates of a track; takes some seconds unless it is stored or cached.
+    """Plan a fast closed line, float64 on CPU, through all gates; takes some seconds unless it is stored or cached.
 
-    Args:
-        track: the track.
-        parameters: the drone; only its mass, thrust and drag matter.
-        limits: the limits of the line.
-
-    Returns:
-        The line, float64 on CPU.
+    Of the drone's parameters only mass, thrust and drag matter.
     """
     with torch.inference_mode(False):
         dynamics, nodes = Dynamics(parameters), LineNodes(track, limits.gate_offset)

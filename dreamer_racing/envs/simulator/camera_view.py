@@ -22,15 +22,12 @@ class NoseMount:
         self._tilt = torch.tensor([camera.tilt], device=device, dtype=dtype)
 
     def __call__(self, position: Tensor, attitude: Tensor, tilt: Tensor | None = None) -> tuple[Tensor, Tensor]:
-        """Return the camera poses.
+        """Return the camera positions (M, 3), m, and axes (M, 3, 3) with rows right, up, backwards, in the world.
 
         Args:
             position: positions of the drones, (M, 3), m.
             attitude: attitudes of the drones, (M, 4) wxyz.
             tilt: tilts of the cameras, (M,), degrees upwards; the camera's own if None.
-
-        Returns:
-            Camera positions (M, 3), and axes (M, 3, 3) with rows right, up, backwards, in the world.
         """
         angle = torch.deg2rad(self._tilt if tilt is None else tilt)
         cosine, sine, zero = angle.cos(), angle.sin(), torch.zeros_like(angle)
@@ -42,16 +39,13 @@ class NoseMount:
 
 
 def points_in_camera(position: Tensor, attitude: Tensor, points: Tensor, camera: Camera) -> Tensor:
-    """Return points in the axes of drones' cameras.
+    """Return points (M, L, 3) in the axes of drones' cameras, m: along the optical axis, to the left, and up.
 
     Args:
         position: positions of the drones, (M, 3), m.
         attitude: attitudes of the drones, (M, 4) wxyz, body → world.
         points: points in the world, (L, 3), or separate ones for each drone (M, L, 3), m.
         camera: the nose camera.
-
-    Returns:
-        (M, L, 3) m: along the optical axis, to the left, and up in the image.
     """
     eye, axes = NoseMount(camera, position.device, position.dtype)(position, attitude)
     right, up, backwards = ((points - eye.unsqueeze(1)) @ axes.mT).unbind(-1)

@@ -31,7 +31,6 @@ class ChaseView:
 
     Args:
         track: the track. Its hall is rendered in nominal colours.
-        parameters: parameters of the drones.
         size: width and height of the images, pixels.
 
     Raises:

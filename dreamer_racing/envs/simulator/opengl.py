@@ -35,7 +35,10 @@ class OpenGLScene:
     def __init__(self, backend: str, model: mujoco.MjModel, camera: Camera) -> None:
         gl = importlib.import_module(f"mujoco.{backend}")
         self._gl: Any = gl.GLContext(camera.width, camera.height)
-        keep_display(backend)
+        if backend == "egl":
+            # MuJoCo and dm_control share EGL's display: if one's exit hook terminated it while contexts of the other
+            # still existed, they would print tracebacks
+            atexit.unregister(importlib.import_module("OpenGL.EGL").eglTerminate)
         _open_contexts.add(self._gl)
         self._gl.make_current()
         self._context = mujoco.MjrContext(model, mujoco.mjtFontScale.mjFONTSCALE_100)
@@ -64,13 +67,9 @@ class OpenGLScene:
         mujoco.mjv_updateScene(model, data, option, mujoco.MjvPerturb(), view, mujoco.mjtCatBit.mjCAT_ALL, self._scene)
 
     def draw(self, position: np.ndarray, up: np.ndarray, forward: np.ndarray, out: np.ndarray) -> None:
-        """Render the scene from a camera pose.
+        """Render into ``out``, uint8 RGB (height, width, 3), first row at the top.
 
-        Args:
-            position: position of the camera, (3,) m.
-            up: the camera's up direction in the world, (3,).
-            forward: its viewing direction in the world, (3,).
-            out: receives the image, uint8 RGB (height, width, 3), first row at the top.
+        The camera's position is in m, its up and viewing directions are in the world, (3,) each.
         """
         for eye in self._eyes:
             eye.pos, eye.up, eye.forward = position, up, forward
@@ -107,15 +106,6 @@ def open_scene(backend: str, model: mujoco.MjModel, camera: Camera) -> OpenGLSce
     except Exception as error:  # PyOpenGL raises anything from AttributeError to GLError
         reason = f"{backend} did not start ({type(error).__name__}: {error}){describe_conflicts(backend)}."
         raise RendererUnavailableError(reason) from error
-
-
-def keep_display(backend: str) -> None:
-    """Unregister the exit hook that terminates EGL's display, which MuJoCo and dm_control share.
-
-    If one library's hook ran while contexts of the other still existed, they would print tracebacks.
-    """
-    if backend == "egl":
-        atexit.unregister(importlib.import_module("OpenGL.EGL").eglTerminate)
 
 
 @atexit.register

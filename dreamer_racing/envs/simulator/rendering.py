@@ -3,15 +3,10 @@
 Only the camera moves: hall and gates are static, and the drone is hidden from its own camera. So a worker prepares the
 scene once, and for each frame only moves the camera and renders.
 
-Workers, in the order in which `renderer="auto"` tries them:
-
-| name | needs | method |
-|---|---|---|
-| `egl` | an EGL library (Mesa's software renderer suffices) | MuJoCo's OpenGL renderer |
-| `osmesa` | OSMesa | the same, slower |
-| `warp` | nothing | `mujoco_warp`'s ray caster, compiled for the CPU |
-
-`warp_cuda`, which `auto` does not try, casts the rays on a CUDA device in one launch and copies the images back.
+Workers, in the order in which `renderer="auto"` tries them: `egl`, MuJoCo's OpenGL renderer with an EGL library (Mesa's
+software renderer suffices); `osmesa`, the same with OSMesa, slower; `warp`, `mujoco_warp`'s ray caster, compiled for
+the CPU, which needs nothing. `warp_cuda`, which `auto` does not try, casts the rays on a CUDA device in one launch
+and copies the images back.
 
 Shapes: M frames. Images are uint8 RGB (M, height, width, 3), first row at the top.
 """
@@ -44,8 +39,7 @@ T = TypeVar("T")
 
 RENDERERS = ("egl", "osmesa", "warp")
 WARP_CUDA = "warp_cuda"
-EXIT_PATIENCE = 10.0
-"""Maximum time for which the exit of the process waits for a frame that is being rendered, s [choice]."""
+EXIT_PATIENCE = 10.0  # s, at most, for which the process's exit waits for a frame that is being rendered [choice]
 
 
 class Worker(Protocol):
@@ -188,14 +182,7 @@ def _end(threads: list[RenderThread], workers: list[Worker]) -> None:
 
 
 class OpenGLWorker:
-    """Worker with MuJoCo's OpenGL renderer.
-
-    Args:
-        backend: `egl` or `osmesa`.
-
-    Raises:
-        RendererUnavailableError: OpenGL did not start.
-    """
+    """Worker with MuJoCo's OpenGL renderer; see `open_scene` for the arguments."""
 
     def __init__(self, backend: str, model: mujoco.MjModel, camera: Camera) -> None:
         self._scene = open_scene(backend, model, camera)

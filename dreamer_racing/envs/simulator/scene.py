@@ -118,12 +118,8 @@ def frame_interval(camera: Camera, control_rate: float) -> int:
 def build_drone(parameters: QuadrotorParameters) -> mujoco.MjSpec:
     """Build the drone in an empty world, which is all that the physics needs.
 
-    Args:
-        parameters: mass, inertia, physics step and integrator.
-
-    Returns:
-        The specification: one free body `drone`, driven by gravity and `qfrc_applied`: a force at its centre of mass in
-        the world frame, N, and a torque in the body frame, N m.
+    It is one free body `drone`, driven by gravity and `qfrc_applied`: a force at its centre of mass in the world frame,
+    N, and a torque in the body frame, N m.
     """
     spec = mujoco.MjSpec()
     spec.modelname = "drone"
@@ -140,16 +136,7 @@ def build_drone(parameters: QuadrotorParameters) -> mujoco.MjSpec:
 
 
 def build_scene(track: Track, parameters: QuadrotorParameters, camera: Camera | None = None) -> mujoco.MjSpec:
-    """Build the scene of a track: `build_drone` in its hall.
-
-    Args:
-        track: gates, decoys and the bounding box, whose sides are the walls of the hall.
-        parameters: the drone; see `build_drone`.
-        camera: the nose camera; the default one if None.
-
-    Returns:
-        The specification, with the camera `nose` on the body `drone`.
-    """
+    """Build the scene of a track: `build_drone` with the camera `nose`, in a hall whose walls are the bounding box."""
     camera = camera or Camera()
     spec = build_drone(parameters)
     spec.modelname = f"drone_race_{track.name}"

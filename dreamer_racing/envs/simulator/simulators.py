@@ -268,7 +268,6 @@ def _make_bodies(
     drone = build_drone(parameters).compile()
     with scope(device):
         model, data = mujoco_warp.put_model(drone), _make_data(drone, num_envs)
-
     return data, partial(mujoco_warp.step, model, data)
 
 
@@ -311,14 +310,8 @@ def memory_of_worlds(
 
 def _array_bytes(data: Any) -> int:
     """Return the bytes of all warp arrays of a (nested) dataclass."""
-    total = 0
-    for field in fields(data):
-        value = getattr(data, field.name)
-        if is_dataclass(value):
-            total += _array_bytes(value)
-        else:
-            total += getattr(value, "capacity", 0)
-    return total
+    values = [getattr(data, field.name) for field in fields(data)]
+    return sum(_array_bytes(value) if is_dataclass(value) else getattr(value, "capacity", 0) for value in values)
 
 
 def check_device(device: torch.device | str) -> None:

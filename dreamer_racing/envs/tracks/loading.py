@@ -19,9 +19,7 @@ from dreamer_racing.settings import quoted, shortened, suggestion
 BUILTIN_TRACKS: tuple[str, ...] = ("circle", "kidney", "figure8", "split_s", "figure8_decoys")
 """Track names that ``load_track`` accepts."""
 
-MAX_BYTES = 100_000
-"""Maximum size of a track file; the maximum number of gates takes a tenth of it [choice]."""
-
+MAX_BYTES = 100_000  # of a track file; the maximum number of gates takes a tenth of it [choice]
 _FOLDER = Path(__file__).parent
 
 

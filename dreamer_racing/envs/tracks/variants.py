@@ -22,8 +22,7 @@ DECORATED = {"figure8": "figure8_decoys"}
 PLAIN_TRACKS: tuple[str, ...] = tuple(name for name in BUILTIN_TRACKS if name not in DECORATED.values())
 """Built-in tracks, without those that only add decoys to another one, which are the same race."""
 
-ATTEMPTS = 1000
-"""Maximum number of displacements drawn to find one that can be flown [choice]."""
+ATTEMPTS = 1000  # displacements drawn, at most, to find one that can be flown [choice]
 
 
 def with_decoys(track: str | Path | Track, decoys: str | None) -> Track:
