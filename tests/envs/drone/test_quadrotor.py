@@ -14,6 +14,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch import Tensor
 
+from dreamer_racing.envs.drone.betaflight import BetaflightParameters
 from dreamer_racing.envs.drone.parameters import GRAVITY, PRESETS, QuadrotorParameters, Randomisation, load_preset
 from dreamer_racing.envs.drone.quadrotor import Quadrotor
 from dreamer_racing.envs.simulator.fused_flight import FusedFlight
@@ -236,41 +237,43 @@ def test_unknown_preset_is_refused_with_the_known_ones() -> None:
 
 
 @pytest.mark.parametrize(
-    ("name", "value", "words"),
+    ("part", "name", "value", "words"),
     [
-        *((name, -1.0, f"{name}=-1.0: must be above 0") for name in (
+        *((QuadrotorParameters, name, -1.0, f"{name}=-1.0: must be above 0") for name in (
             "mass", "arm_length", "torque_constant", "rotor_thrust_max", "collective_thrust_scale", "rate_gain",
             "physics_dt", "control_dt", "motor_time_constant",
         )),
-        ("physics_dt", 0.003, "control_dt=0.02 s must be a whole multiple of physics_dt=0.003"),
-        ("mass", math.nan, "mass=nan: must be above 0"),
-        ("motor_time_constant", math.nan, "=nan: must be above 0"),
-        ("mass", "light", "mass='light': must be a number"),
-        ("command_delay", -0.01, "command_delay=-0.01: must be at least 0"),
-        ("inertia", (0.002, 0.0, 0.003), r"inertia=\(0.002, 0.0, 0.003\): must be three numbers, each above 0"),
-        ("drag", (0.1, 0.1), "drag=.*: must be three numbers, each at least 0"),
-        ("body_rate_max", (10.0, -10.0, 4.0), "body_rate_max=.*: must be three numbers, each above 0"),
-        ("integrator", "implicitfast", "integrator='implicitfast': must be Euler or RK4"),
-        ("randomisation", True, "randomisation=True: must be a Randomisation or None"),
+        *((QuadrotorParameters, *row) for row in (
+            ("physics_dt", 0.003, "control_dt=0.02 s must be a whole multiple of physics_dt=0.003"),
+            ("mass", math.nan, "mass=nan: must be above 0"),
+            ("motor_time_constant", math.nan, "motor_time_constant=nan: must be above 0"),
+            ("motor_lag_of", "voltage", "motor_lag_of='voltage': must be speed or thrust"),
+            ("mass", "light", "mass='light': must be a number"),
+            ("command_delay", -0.01, "command_delay=-0.01: must be at least 0"),
+            ("inertia", (0.002, 0.0, 0.003), r"inertia=\(0.002, 0.0, 0.003\): must be three numbers, each above 0"),
+            ("drag", (0.1, 0.1), "drag=.*: must be three numbers, each at least 0"),
+            ("body_rate_max", (10.0, -10.0, 4.0), "body_rate_max=.*: must be three numbers, each above 0"),
+            ("integrator", "implicitfast", "integrator='implicitfast': must be Euler or RK4"),
+            ("randomisation", True, "randomisation=True: must be a Randomisation or None"),
+            ("betaflight", True, "betaflight=True: must be a BetaflightParameters or None"),
+        )),
+        *((Randomisation, *row) for row in (
+            ("mass", 1.0, "mass=1.0: .*at least 0 and below 1"),
+            ("torque", math.nan, "torque=nan: .*at least 0 and below 1"),
+            ("delay_max", math.inf, "delay_max=inf: must be at least 0, and finite"),
+            ("delay_min", 0.05, "delay_min=0.05: must be at most delay_max=0.04"),
+            ("thrust", "much", "thrust='much': must be a number"),
+        )),
+        *((BetaflightParameters, *row) for row in (
+            ("p", (45.0, 47.0), "p=.*three numbers"),
+            ("motor_idle", 0.5, "motor_idle=0.5: must be at least 0 and at most 0.2"),
+            ("gyro_lpf1", (250.0, 0.0), "gyro_lpf1=.*two cut-offs above 0"),
+        )),
     ],
 )  # fmt: skip
-def test_bad_parameters_are_refused(name: str, value: object, words: str) -> None:
-    with pytest.raises(ValueError, match=f"QuadrotorParameters: .*{words}"):
-        QuadrotorParameters(**{name: value})
-
-
-@pytest.mark.parametrize(
-    ("name", "value", "words"),
-    [
-        ("mass", 1.0, "mass=1.0: .*at least 0 and below 1"),
-        ("torque", math.nan, "torque=nan: .*at least 0 and below 1"),
-        ("delay_max", math.inf, "delay_max=inf: must be at least 0, and finite"),
-        ("thrust", "much", "thrust='much': must be a number"),
-    ],
-)
-def test_bad_randomisation_widths_are_refused(name: str, value: object, words: str) -> None:
-    with pytest.raises(ValueError, match=f"Randomisation: {words}"):
-        Randomisation(**{name: value})
+def test_bad_parameters_are_refused(part: type, name: str, value: object, words: str) -> None:
+    with pytest.raises(ValueError, match=f"{part.__name__}: {words}"):
+        part(**{name: value})
 
 
 # The kernels compute what `TorchFlight` states in torch, for drones in every condition.

@@ -6,7 +6,7 @@ import torch
 from dreamer_racing.envs.drone.parameters import PRESETS
 from dreamer_racing.envs.race import racing_line
 from dreamer_racing.envs.race.gates import CrashCause
-from dreamer_racing.envs.race.pilot import PilotPolicy, ScriptedPilot, evaluate_pilot
+from dreamer_racing.envs.race.pilot import ScriptedPilot, evaluate_pilot
 from dreamer_racing.envs.race.racing_line import (
     START_LINE,
     Dynamics,
@@ -18,7 +18,6 @@ from dreamer_racing.envs.race.racing_line import (
     search_line,
     stored_lines,
 )
-from dreamer_racing.envs.torchrl_env import DroneRacingEnv
 from dreamer_racing.envs.tracks import BUILTIN_TRACKS, PLAIN_TRACKS, load_track
 
 ESTIMATED_LAPS = {"circle": 2.7, "kidney": 3.6, "figure8": 4.3, "split_s": 5.8}
@@ -74,14 +73,6 @@ def test_a_drone_put_elsewhere_is_flown_as_a_new_one() -> None:
     for _ in range(5):
         pilot.act(away, level, torch.tensor([[9.0, 0.0, 0.0]]), torch.ones(1, 3), torch.tensor([1]))
     torch.testing.assert_close(pilot.act(start, level, still, still, gate), fresh)
-
-
-def test_policy_flies_the_torchrl_environment() -> None:
-    env = DroneRacingEnv("circle", num_envs=4, from_pixels=False, seed=0)
-    rollout = env.rollout(150, PilotPolicy(ScriptedPilot(env.track)), break_when_any_done=False)
-    assert not rollout["next", "terminated"].any()
-    assert (rollout["next", "race", "gates_passed"][:, -1] >= 3).all()
-    env.close()
 
 
 def test_line_passes_every_gate_and_keeps_to_the_thrust_limit(circle_line: RacingLine) -> None:

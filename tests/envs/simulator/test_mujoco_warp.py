@@ -87,7 +87,6 @@ def test_images_are_those_of_the_cpu_backends_ray_caster(device: str) -> None:
     ours = on_warp(device, images=True, camera=camera)
     ours.load_state_dict(reference.state_dict())
     images, expected = ours.render(), reference.render()
-    reference.close()
     assert images.shape == (N, 32, 48, 3)
     assert images.device.type == device
     difference = (images.cpu().float() - expected.float()).abs()
@@ -95,10 +94,6 @@ def test_images_are_those_of_the_cpu_backends_ray_caster(device: str) -> None:
     assert expected.float().std() > 30.0
     mask = torch.tensor([True, False, False, True, True, False], device=device)
     assert torch.equal(ours.render(mask), images[mask])
-    for _ in range(2):
-        ours.close()
-        with pytest.raises(RuntimeError, match="it is closed.$"):
-            ours.render()
 
 
 @everywhere
@@ -227,12 +222,8 @@ def test_the_hybrid_renderer_needs_cuda() -> None:
 
 @pytest.mark.gpu
 def test_the_hybrid_renderer_draws_the_same() -> None:
-    drawn = {}
-    for renderer in ("warp", "warp_cuda"):
-        simulator = on_mujoco(renderer=renderer)
-        drawn[renderer] = simulator.render().float()
-        simulator.close()
-    assert (drawn["warp"] - drawn["warp_cuda"]).abs().mean() < 0.5
+    on_cpu, on_cuda = (on_mujoco(renderer=renderer).render().float() for renderer in ("warp", "warp_cuda"))
+    assert (on_cpu - on_cuda).abs().mean() < 0.5
 
 
 # Every warp kernel that a control step launches compiles for a GPU, which needs none, nor a driver.
@@ -246,11 +237,8 @@ def test_every_kernel_compiles_for_cuda(tmp_path: Path, monkeypatch: pytest.Monk
     """Those that MuJoCo's warp port chooses for a GPU instead of a CPU, if there are any, are not among them."""
     warp = load_warp()
     for looks in ("nominal", "randomised"):
-        generator = torch.Generator().manual_seed(0)
-        simulator = WarpSimulator(
-            load_track("kidney"), PRESETS["faithful"], 2, device="cpu", generator=generator, looks=load_looks(looks)
-        )
-        simulator.step(torch.zeros(2, 4))
+        simulator = on_warp("cpu", "faithful", images=True, looks=load_looks(looks))
+        simulator.step(torch.zeros(N, 4))
         simulator.render()
     ran = {name: module for name, module in warp._src.context.user_modules.items() if module.execs}
     for wanted in ("apply_controls", "correct_step", "_render_megakernel", "forward", "smooth"):

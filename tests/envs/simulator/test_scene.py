@@ -206,10 +206,7 @@ def worlds(looks: str | LooksRandomisation | None, renderer: str = "auto", seed:
 
 
 def images(looks: str | LooksRandomisation | None, renderer: str = "warp", **arguments) -> Tensor:
-    made = worlds(looks, renderer, **arguments)
-    drawn = made.render().float()
-    made.close()
-    return drawn
+    return worlds(looks, renderer, **arguments).render().float()
 
 
 @pytest.mark.parametrize("renderer", IN_PROCESS)
@@ -233,8 +230,6 @@ def test_renderers_agree_about_looks(renderer: str) -> None:
     first, *others = (each.render().float() for each in made)
     for other in others:
         assert (first - other).abs().mean() < 3.0
-    for each in made:
-        each.close()
 
 
 @pytest.mark.parametrize(
@@ -257,7 +252,6 @@ def test_a_wider_lens_shows_gates_smaller() -> None:
     order = looks.field_of_view.argsort()
     assert (orange[order].diff() <= 0).all()
     assert orange[order[0]] > 1.2 * orange[order[-1]]
-    made.close()
 
 
 def test_an_episode_keeps_its_looks_and_the_next_has_others() -> None:
@@ -270,7 +264,6 @@ def test_an_episode_keeps_its_looks_and_the_next_has_others() -> None:
     for name, value in after.items():
         assert torch.equal(value[~mask], before[name][~mask])
         assert (value[mask] != before[name][mask]).reshape(N // 2, -1).any(1).all()
-    made.close()
 
 
 def test_gates_and_surfaces_vary_apart() -> None:
@@ -278,7 +271,6 @@ def test_gates_and_surfaces_vary_apart() -> None:
     looks = made.simulator.looks
     changed = (looks.looks.colors != looks._nominal).flatten(2).any(2)  # (N, K)
     assert changed.sum(1).tolist() == [1] * N  # kidney's gates share one colour
-    made.close()
 
 
 def test_noise_is_of_the_width_asked_for_and_new_in_every_image() -> None:
@@ -288,7 +280,6 @@ def test_noise_is_of_the_width_asked_for_and_new_in_every_image() -> None:
     assert (first - clean)[inner].std() == pytest.approx(0.02 * 255, rel=0.05)
     assert abs(float((first - clean)[inner].mean())) < 0.1
     assert not torch.equal(first, second)
-    made.close()
 
 
 @pytest.mark.parametrize(("saved", "present"), [(None, "randomised"), ("randomised", None)])
@@ -297,8 +288,6 @@ def test_a_state_with_other_looks_is_refused(saved: str | None, present: str | N
     name = saved or "nominal"
     with pytest.raises(ValueError, match=f"the saved worlds have looks={name}, so resume"):
         other.load_state_dict(one.state_dict())
-    one.close()
-    other.close()
 
 
 def test_bad_looks_are_refused() -> None:

@@ -168,9 +168,7 @@ def level(*yaws_degrees: float, position: tuple[float, float, float] = (0.0, -1.
 def images(renderer: str, start: tuple[Tensor, ...], **arguments) -> Tensor:
     made = simulator(len(start[0]), renderer_or_skip(renderer), **arguments)
     made.reset(everyone(len(start[0])), *start)
-    drawn = made.render()
-    made.close()
-    return drawn
+    return made.render()
 
 
 @pytest.mark.parametrize("renderer", IN_PROCESS)
@@ -211,9 +209,7 @@ def test_osmesa_draws_what_warp_draws(tmp_path: Path) -> None:
 def test_image_shows_what_rays_hit() -> None:
     """An oracle of its own: colours along rays cast by MuJoCo's C engine."""
     camera = Camera()
-    made = simulator(1, renderer_or_skip("egl"))
-    (image,) = made.render().numpy()
-    made.close()
+    (image,) = simulator(1, renderer_or_skip("egl")).render().numpy()
     model = build_scene(KIDNEY, EASY, camera).compile()
     data = mujoco.MjData(model)
     position, attitude, _ = poses(1)
@@ -277,7 +273,6 @@ def test_masked_images_are_rows_of_all_images(renderer: str, num_threads: int) -
     assert len({image.numpy().tobytes() for image in whole}) == 5
     made.step(actions(1, 5)[0])
     assert not torch.equal(made.render(), whole)  # and the first images were not overwritten in place
-    made.close()
 
 
 def without(*libraries: str):
@@ -300,7 +295,6 @@ def test_auto_falls_back_and_says_why(monkeypatch: pytest.MonkeyPatch, caplog: p
     assert made.renderer is not None
     assert made.renderer.name == "warp"
     assert made.render().shape == (2, 64, 64, 3)
-    made.close()
     assert "renderer: warp" in caplog.text
     assert "egl needs libEGL.so.1, which is not installed (Debian: apt-get install libegl1" in caplog.text
     assert [record.levelname for record in caplog.records] == ["WARNING"]
@@ -309,8 +303,8 @@ def test_auto_falls_back_and_says_why(monkeypatch: pytest.MonkeyPatch, caplog: p
 def test_a_renderer_that_was_asked_for_is_no_warning_and_said_once(caplog: pytest.LogCaptureFixture) -> None:
     rendering.log_once.cache_clear()
     with caplog.at_level(logging.INFO, logger=rendering.__name__):
-        simulator(2, "warp").close()
-        simulator(2, "warp").close()  # of evaluations, say
+        simulator(2, "warp")
+        simulator(2, "warp")  # of evaluations, say
     assert [(record.levelname, record.message[:14]) for record in caplog.records] == [("INFO", "renderer: warp")]
 
 

@@ -78,7 +78,8 @@ def test_the_example_of_the_page_gives_every_default(write):
     given = yaml.safe_load(example)
     assert {"start", "bounds", "shape"} < given.keys()
     track = load_track(write(example))
-    plain = load_track(write(yaml.safe_dump({name: given[name] for name in ("name", "gates")})))
+    plain = load_track(write(yaml.safe_dump({"gates": given["gates"]})))
+    assert plain.name == "mine"  # of its file, mine.yaml
     for name in ("start_position", "start_yaw_degrees", "bounds_low", "bounds_high"):
         assert getattr(plain, name) == pytest.approx(getattr(track, name))
     assert (plain.gates, plain.shape, plain.laps) == (track.gates, track.shape, track.laps)
@@ -108,25 +109,8 @@ def test_split_s_is_the_published_track():
     assert track.gates[4].position == (-4.3, -5.6, 1.42)
     assert [gate.yaw_degrees for gate in track.gates] == [-20, 0, -130, 180, 0, 80, -150]
     assert track.start_position == (-5.0, 4.7, 0.61)
+    assert track.start_yaw_degrees == pytest.approx(math.degrees(math.atan2(-5.56, 4.4)))  # to the first gate
     assert (track.bounds_low, track.bounds_high) == ((-10, -8, 0.05), (14, 9, 6))
-
-
-def test_defaults():
-    track = load_track("kidney")
-    assert track.start_position == pytest.approx((-5.5, -2.5, 1.35))  # 2.5 m before gate 0, which faces +y
-    assert track.start_yaw_degrees == pytest.approx(90)
-    # Frames reach from -6.525 to 6.525 (gates 0 and 4 face along y) and from -4 - 1.025 to 3.2 + 1.025.
-    assert track.bounds_low == pytest.approx((-9.525, -8.025, 0))
-    assert track.bounds_high == pytest.approx((9.525, 7.225, 6))
-    # With only a position given, the start faces the first gate.
-    assert load_track("split_s").start_yaw_degrees == pytest.approx(math.degrees(math.atan2(-5.56, 4.4)))
-
-
-def test_tensors():
-    track = load_track("circle")
-    assert track.gate_positions().tolist()[1] == [0.0, 4.0, pytest.approx(1.35)]
-    assert track.gate_yaws(dtype=torch.float64).tolist() == pytest.approx([math.pi / 2, math.pi, -math.pi / 2, 0])
-    assert track.gate_normals()[1].tolist() == pytest.approx([-1.0, 0.0, 0.0], abs=1e-6)
 
 
 # ---------------------------------------------------------------- files
@@ -146,11 +130,6 @@ def test_a_good_file(write):
             bounds_high=(10, 10, 5),
             laps=2,
         )
-
-
-def test_only_gates_are_needed(write):
-    path = write("gates:\n- {position: [0, 0, 2], yaw_degrees: 0}\n- {position: [5, 0, 2], yaw_degrees: 0}\n")
-    assert load_track(path) == make_track("mine", [Gate((0, 0, 2), 0), Gate((5, 0, 2), 0)])
 
 
 # Each case: what to replace in GOOD, by what, and the pieces that the message must have.
