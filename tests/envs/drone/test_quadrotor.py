@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import copy
 import math
 from dataclasses import replace
 from pathlib import Path
@@ -174,25 +173,18 @@ def test_randomised_drones_obey_their_own_newton_and_euler_equations() -> None:
     torch.testing.assert_close(found[:, 2] / 0.6, (own["thrust"] * rotors[:, 2:3] / (0.6 * own["mass"]))[:, 0])
 
 
-class Body:
-    """One drone of a preset, thrown with a spin, under given wrenches."""
-
-    def __init__(self, parameters: QuadrotorParameters) -> None:
-        self.model = build_drone(parameters).compile()
-        self.data = mujoco.MjData(self.model)
-        self.data.qvel[:] = (5.0, 0.0, 2.0, 3.0, -2.0, 1.0)
-        arrays = (self.data.qpos, self.data.qvel, self.data.qfrc_applied)
-        views = [torch.from_numpy(array).unsqueeze(0) for array in arrays]
-        self.flight = TorchFlight(Quadrotor(parameters, 1), *views, lambda: mujoco.mj_step(self.model, self.data))
-
-    def fly(self, wrenches: torch.Tensor, substeps: int) -> torch.Tensor:
-        """Hold each wrench (6,) for so many steps; return the positions (T, 3)."""
-        path = []
-        for held in wrenches:
-            for _ in range(substeps):
-                self.flight.apply(held.unsqueeze(0))
-            path.append(self.flight.qpos[0, :3].clone())
-        return torch.stack(path)
+def thrown(parameters: QuadrotorParameters, wrenches: torch.Tensor, substeps: int) -> torch.Tensor:
+    """Positions (T, 3) of a drone, thrown with a spin, that holds each wrench (6,) for so many steps."""
+    model = build_drone(parameters).compile()
+    data = mujoco.MjData(model)
+    data.qvel[:] = (5.0, 0.0, 2.0, 3.0, -2.0, 1.0)
+    views = [torch.from_numpy(array).unsqueeze(0) for array in (data.qpos, data.qvel, data.qfrc_applied)]
+    flight, path = TorchFlight(Quadrotor(parameters, 1), *views, lambda: mujoco.mj_step(model, data)), []
+    for held in wrenches:
+        for _ in range(substeps):
+            flight.apply(held.unsqueeze(0))
+        path.append(flight.qpos[0, :3].clone())
+    return torch.stack(path)
 
 
 def test_easy_integrator_stays_within_a_millimetre_of_rk4_over_two_seconds() -> None:
@@ -200,8 +192,8 @@ def test_easy_integrator_stays_within_a_millimetre_of_rk4_over_two_seconds() -> 
     wrenches = torch.zeros(1000, 6, dtype=torch.float64)
     wrenches[:, 2] = 8.0 + 5.0 * torch.sin(5.0 * time)  # N
     wrenches[:, 3:] = 0.02 * torch.stack([torch.cos(rate * time) for rate in (20.0, 23.0, 7.0)], dim=1)  # N m
-    path = Body(EASY).fly(wrenches, substeps=1)
-    reference = Body(replace(EASY, physics_dt=0.001, integrator="RK4")).fly(wrenches, substeps=2)
+    path = thrown(EASY, wrenches, substeps=1)
+    reference = thrown(replace(EASY, physics_dt=0.001, integrator="RK4"), wrenches, substeps=2)
     assert (path - reference).norm(dim=-1).max() < 1e-3
 
 
@@ -304,12 +296,10 @@ class Bodies:
 
 @pytest.mark.parametrize("parameters", [*PRESETS.values(), DELAYED], ids=[*PRESETS, "late"])
 def test_kernels_do_what_torch_does(parameters: QuadrotorParameters) -> None:
-    quadrotor = Quadrotor(parameters, N, generator=torch.Generator().manual_seed(1))
-    quadrotor.reset(torch.ones(N, dtype=torch.bool))
-    quadrotor.rotor_speed.uniform_(0.0, 2.0)
-    other = copy.deepcopy({name: value for name, value in vars(quadrotor).items() if name != "_generator"})
-    reference = Quadrotor(parameters, N, generator=torch.Generator().manual_seed(1))
-    vars(reference).update(other)
+    quadrotor, reference = (Quadrotor(parameters, N, generator=torch.Generator().manual_seed(1)) for _ in range(2))
+    for each in (quadrotor, reference):
+        each.reset(torch.ones(N, dtype=torch.bool))
+        each.rotor_speed.uniform_(0.0, 2.0, generator=torch.Generator().manual_seed(3))
     ours, theirs = Bodies(), Bodies()
     fused = FusedFlight(quadrotor, ours.qpos, ours.qvel, ours.force, ours.integrate)
     flight = TorchFlight(reference, theirs.qpos, theirs.qvel, theirs.force, theirs.integrate)
