@@ -1,6 +1,5 @@
 """The batched simulator: drones that do not know of each other, and renderers that agree."""
 
-import ctypes
 import logging
 import math
 import os
@@ -266,20 +265,8 @@ def test_masked_images_are_rows_of_all_images(renderer: str, num_threads: int) -
     assert not torch.equal(made.render(), whole)  # and the first images were not overwritten in place
 
 
-def without(*libraries: str):
-    """A `ctypes.CDLL` that cannot find these."""
-    original = ctypes.CDLL
-
-    def load(name, *arguments, **keywords):
-        if name is not None and any(library in str(name) for library in libraries):
-            raise OSError(f"{name}: cannot open shared object file")
-        return original(name, *arguments, **keywords)
-
-    return load
-
-
 def test_auto_falls_back_and_says_why(monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture) -> None:
-    monkeypatch.setattr(opengl.ctypes, "CDLL", without("libEGL", "libOSMesa"))
+    monkeypatch.setattr(opengl, "loads", lambda library: False)
     rendering.log_once.cache_clear()
     with caplog.at_level(logging.INFO, logger=rendering.__name__):
         made = simulator(2, "auto")
@@ -300,7 +287,7 @@ def test_a_renderer_that_was_asked_for_is_no_warning_and_said_once(caplog: pytes
 
 
 def test_renderer_that_was_asked_for_is_not_replaced(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(opengl.ctypes, "CDLL", without("libEGL"))
+    monkeypatch.setattr(opengl, "loads", lambda library: "libEGL" not in library)
     with pytest.raises(RendererUnavailableError, match="egl needs libEGL.so.1"):
         simulator(1, "egl")
 
