@@ -15,15 +15,23 @@ from dataclasses import dataclass
 
 from dreamer_racing.settings import NOT_NEGATIVE, POSITIVE, SHARE, Range, check_settings, check_three, setting
 
-# all [doc]: values of one unit of the gains, in thousandths of the motor range per deg/s, deg and deg/s²
 P_SCALE, I_SCALE, D_SCALE = 0.032029, 0.244381, 0.000529
-YAW_I_SCALE = 2.5  # additional factor of yaw's I in the firmware
-# anti-gravity per unit of smoothed throttle change per second: addition to I, and relative increase of P
+"""Values of one unit of the gains, in thousandths of the motor range per deg/s, deg and deg/s² [doc]."""
+
+YAW_I_SCALE = 2.5
+"""Additional factor of yaw's I in the firmware [doc]."""
+
 ANTI_GRAVITY_I, ANTI_GRAVITY_P = 0.34, 0.0034
-D_MAX_SCALE = 0.00008 / 35.0  # of d_max_advance: relative increase of D, up to D-max, per deg/s² of setpoint change
-D_MAX_CUTOFF = 35.0  # Hz, of the second-order low-pass of the increase from D to D-max
-# ratio of the cut-off of each of two equal first-order low-passes to that of the two in series
+"""Anti-gravity per unit of smoothed throttle change per second: addition to I, and relative increase of P [doc]."""
+
+D_MAX_SCALE = 0.00008 / 35.0
+"""Scale of d_max_advance: relative increase of D, up to D-max, per deg/s² of setpoint change [doc]."""
+
+D_MAX_CUTOFF = 35.0
+"""Cut-off of the second-order low-pass of the increase from D to D-max, Hz [doc]."""
+
 PT2_CORRECTION = 1.0 / math.sqrt(math.sqrt(2.0) - 1.0)
+"""Ratio of the cut-off of each of two equal first-order low-passes to that of the two in series [doc]."""
 
 
 @dataclass(frozen=True)

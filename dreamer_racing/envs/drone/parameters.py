@@ -29,10 +29,10 @@ from dreamer_racing.settings import (
 
 T = TypeVar("T")
 GRAVITY = 9.81  # m/s²
-# MuJoCo's names of the allowed integrators: `FusedFlight` corrects Euler to second order; RK4 needs no correction
 INTEGRATORS = ("Euler", "RK4")
-# quantity with first-order lag to its target: a rotor's speed, or its thrust, which is the square of the speed
+"""MuJoCo's names of the allowed integrators: `FusedFlight` corrects Euler to second order; RK4 needs no correction."""
 MOTOR_LAGS = ("speed", "thrust")
+"""Quantity with first-order lag to its target: a rotor's speed, or its thrust, which is the square of the speed."""
 
 
 @dataclass(frozen=True)
@@ -156,7 +156,9 @@ PRESETS: dict[str, QuadrotorParameters] = {
     ),
 }
 
-SUFFIXES = (".yaml", ".yml")  # of drone files
+
+SUFFIXES = (".yaml", ".yml")
+"""File name suffixes of drone files."""
 
 
 def load_preset(preset: str | QuadrotorParameters) -> QuadrotorParameters:
@@ -239,7 +241,8 @@ def _differences(base: Any, changed: Any) -> dict[str, Any]:
     return found
 
 
-MIN_CONTROL_RATE = 10.0  # Hz, at which a drone at 18 m/s flies 1.8 m per step [choice]
+MIN_CONTROL_RATE = 10.0
+"""Lowest control rate, Hz, at which a drone at 18 m/s flies 1.8 m per step [choice]."""
 
 
 def at_control_rate(parameters: QuadrotorParameters, rate: float | None) -> QuadrotorParameters:

@@ -21,12 +21,15 @@ from dreamer_racing.envs.simulator.simulators import DroneState
 from dreamer_racing.envs.tracks import Track
 from dreamer_racing.settings import FINITE, check_settings, quoted, setting
 
-# all [choice]
-EPISODE_TIME = 20.0  # s after which a training episode is truncated
-EVALUATION_TIME = 30.0  # s after which an evaluation episode is truncated: three laps of split_s take a good pilot 22 s
-# m/s, up to which two gates passed in one control step both count: a thrust of 2.7 times the weight plus the weight,
-# over 30 m without drag, gives 47
+EPISODE_TIME = 20.0
+"""Time after which a training episode is truncated, s [choice]."""
+
 MAX_SPEED = 50.0
+"""Speed up to which two gates passed in one control step both count, m/s: a thrust of 2.7 times the weight plus the
+weight, over 30 m without drag, gives 47 [choice]."""
+
+EVALUATION_TIME = 30.0
+"""Time after which an evaluation episode is truncated, s: three laps of split_s take a good pilot 22 s [choice]."""
 
 RACE_VECTOR_SIZE = 21
 VELOCITY, RATES, DISTANCE = 5.0, 5.0, 4.0  # m/s, rad/s, m
@@ -46,17 +49,28 @@ RACE_VECTOR_ENTRIES = (
 class RaceStep:
     """Outcome of one control step for each drone; every tensor is (N,)."""
 
-    reward_base: Tensor  # float: the reward at b₂ = 0 (Eq. 1)
-    body_rate_norm: Tensor  # float: ‖ω‖ in steps in which Eq. 1 has a rate term, 0 on a pass or crash, rad/s
-    terminated: Tensor  # bool: the drone crashed
-    truncated: Tensor  # bool: out of time, or the last lap is complete; never together with ``terminated``
-    passes: Tensor  # int64: gates passed in this step; 2 only if gates lie within a control step's reach of each other
-    gates_passed: Tensor  # int64: gates passed in this episode
-    gate_offset: Tensor  # float: distance from the gate's centre at a pass in this step, else 0, m
-    lap_time: Tensor  # float: duration of the lap completed in this step, else 0, s
-    crash: Tensor  # int64: ``CrashCause``, 0 while flying
-    finished: Tensor  # bool: the last lap was completed, without a crash in the same step
-    target_gate: Tensor  # int64: the gate to pass next, after this step
+    reward_base: Tensor
+    """float: the reward at b₂ = 0 (Eq. 1)."""
+    body_rate_norm: Tensor
+    """float: ‖ω‖ in steps in which Eq. 1 has a rate term, 0 on a pass or crash, rad/s."""
+    terminated: Tensor
+    """bool: the drone crashed."""
+    truncated: Tensor
+    """bool: out of time, or the last lap is complete; never together with ``terminated``."""
+    passes: Tensor
+    """int64: gates passed in this step; 2 only if gates lie within a control step's reach of each other."""
+    gates_passed: Tensor
+    """int64: gates passed in this episode."""
+    gate_offset: Tensor
+    """float: distance from the gate's centre at a pass in this step, else 0, m."""
+    lap_time: Tensor
+    """float: duration of the lap completed in this step, else 0, s."""
+    crash: Tensor
+    """int64: ``CrashCause``, 0 while flying."""
+    finished: Tensor
+    """bool: the last lap was completed, without a crash in the same step."""
+    target_gate: Tensor
+    """int64: the gate to pass next, after this step."""
 
     def reward(self, body_rate_weight: float) -> Tensor:
         """Return the reward (N,) for a body-rate weight b₂. Reference: paper, Eq. 1."""

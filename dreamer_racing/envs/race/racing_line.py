@@ -34,20 +34,27 @@ STORED = Path(__file__).with_name("racing_lines.npz")
 class LineLimits:
     """Limits of the racing line."""
 
-    # largest fraction of the maximum collective thrust that the line may use; sets the aggressiveness. 0.9 leaves a
-    # margin for corrections and for randomised drones with 14 % less thrust; above 0.95 the laps get no faster
     speed: float = 0.9
-    gate_offset: float = 0.25  # m, at most, from a gate's centre to the left and up; at most 40 % of the half opening
-    body_rate_max: float = 6.0  # rad/s, of roll and pitch
-    angular_acceleration_max: float = 40.0  # rad/s², of roll and pitch
-    thrust_min: float = 4.0  # m/s², collective; near zero thrust the attitude is undefined
-    gate_cosine: float = 0.75  # at least, of the angle between the velocity and a gate's normal
-    clearance: float = 0.5  # m, at least, from the bounding box
-    height_min: float = 0.6  # m
+    """Largest fraction of the maximum collective thrust that the line may use; sets the aggressiveness. 0.9 leaves a
+    margin for corrections and for randomised drones with 14 % less thrust; above 0.95 the laps get no faster."""
+    gate_offset: float = 0.25
+    """Maximum distance from a gate's centre to the left and up, m; at most 40 % of the half opening."""
+    body_rate_max: float = 6.0
+    """Maximum roll and pitch rate, rad/s."""
+    angular_acceleration_max: float = 40.0
+    """Maximum roll and pitch acceleration, rad/s²."""
+    thrust_min: float = 4.0
+    """Minimum collective thrust, m/s²; near zero thrust the attitude is undefined."""
+    gate_cosine: float = 0.75
+    """Minimum cosine of the angle between the velocity and a gate's normal."""
+    clearance: float = 0.5
+    """Minimum distance from the bounding box, m."""
+    height_min: float = 0.6
+    """Minimum height, m."""
 
 
-# of the line on which training episodes begin: slow enough to fly on from a noisy start
 START_LINE = LineLimits(speed=0.7)
+"""Limits of the line on which training episodes begin: slow enough to fly on from a noisy start."""
 
 
 @dataclass(frozen=True)

@@ -34,8 +34,12 @@ DECORATED = {"figure8": "figure8_decoys"}
 PLAIN_TRACKS: tuple[str, ...] = tuple(name for name in BUILTIN_TRACKS if name not in DECORATED.values())
 """Built-in tracks, without those that only add decoys to another one, which are the same race."""
 
-ATTEMPTS = 1000  # displacements drawn, at most, to find one that can be flown [choice]
-MAX_BYTES = 100_000  # of a track file; the maximum number of gates takes a tenth of it [choice]
+ATTEMPTS = 1000
+"""Maximum number of displacements drawn to find one that can be flown [choice]."""
+
+MAX_BYTES = 100_000
+"""Maximum size of a track file; the maximum number of gates takes a tenth of it [choice]."""
+
 _FOLDER = Path(__file__).parent
 
 

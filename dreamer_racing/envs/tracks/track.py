@@ -18,11 +18,17 @@ if TYPE_CHECKING:
 
 Vector = tuple[float, float, float]
 
-# all [choice]
-GROUND_HEIGHT = 0.05  # m, of a drone's centre below which it has hit the ground: half of its 0.1 m height
-START_DISTANCE = 2.5  # m, of the default start pose before the first gate
-BOUNDS_CLEARANCE = 3.0  # m, of the default bounding box from the race gates' frames
-DEFAULT_CEILING = 6.0  # m, height of the default bounding box
+GROUND_HEIGHT = 0.05
+"""Height (m) of a drone's centre below which it has hit the ground: half of its 0.1 m height [choice]."""
+
+START_DISTANCE = 2.5
+"""Distance (m) of the default start pose before the first gate [choice]."""
+
+BOUNDS_CLEARANCE = 3.0
+"""Distance (m) of the default bounding box from the race gates' frames [choice]."""
+
+DEFAULT_CEILING = 6.0
+"""Height (m) of the default bounding box [choice]."""
 
 
 class TrackError(ValueError):
@@ -107,15 +113,24 @@ class GateShape:
 class Track:
     """A race track. Read one with ``load_track`` or build one with ``make_track``."""
 
-    name: str  # short, for logs and plots
-    gates: tuple[Gate, ...]  # race gates in the order of flight
-    decoys: tuple[Gate, ...]  # gates that are only rendered
-    shape: GateShape  # dimensions of every gate
-    start_position: Vector  # m
-    start_yaw_degrees: float  # heading of the start pose, degrees from world x, positive to the left
-    bounds_low: Vector  # lower corner of the box that a drone must not leave, m
-    bounds_high: Vector  # upper corner of the same box, m
-    laps: int = 3  # of an evaluation episode
+    name: str
+    """Short name, for logs and plots."""
+    gates: tuple[Gate, ...]
+    """Race gates in the order of flight."""
+    decoys: tuple[Gate, ...]
+    """Gates that are only rendered."""
+    shape: GateShape
+    """Dimensions of every gate."""
+    start_position: Vector
+    """Position of the start pose, m."""
+    start_yaw_degrees: float
+    """Heading of the start pose, degrees from world x, positive to the left."""
+    bounds_low: Vector
+    """Lower corner of the box that a drone must not leave, m."""
+    bounds_high: Vector
+    """Upper corner of the same box, m."""
+    laps: int = 3
+    """Number of laps of an evaluation episode."""
 
     def __post_init__(self) -> None:
         _normalise(self, ("start_yaw_degrees",), ("start_position", "bounds_low", "bounds_high"))

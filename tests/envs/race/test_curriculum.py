@@ -141,6 +141,20 @@ def test_one_step_is_rewarded(previous, position, given, expected):
     assert tuple(part.item() for part in parts) == expected
 
 
+def test_drones_are_independent():
+    base, rate = race_reward(
+        RewardWeights(),
+        GATE.expand(3, 3),
+        torch.zeros(3, 3),
+        torch.tensor([[1.0, 0.0, 0.0], [2.0, 0.0, 0.0], [math.nan, 0.0, 0.0]]),
+        RATES.expand(3, 3),
+        torch.tensor([False, True, False]),
+        torch.tensor([False, False, True]),
+    )
+    assert base.tolist() == [1.0, 10.0, -4.0]
+    assert rate.tolist() == [3.0, 0.0, 0.0]
+
+
 @pytest.mark.parametrize("track", ["kidney", "figure8", "split_s", "circle"])
 def test_a_race_vector_says_where_the_drone_is(track: str) -> None:
     worlds = RaceWorlds(track, num_envs=64, from_pixels=False, start_on_line=1.0)
