@@ -12,7 +12,7 @@ import pytest
 import torch
 from matplotlib.figure import Figure
 
-import tests.planned_lines  # noqa: F401 - before anything is planned
+import dreamer_racing.envs  # noqa: F401 - before TorchRL, as in the package: OpenGL's variables are heeded here
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:

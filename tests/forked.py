@@ -25,9 +25,9 @@ RECIPES = Path(__file__).resolve().parents[1] / "recipes"
 SERVER = multiprocessing.get_context("forkserver")
 SERVER.set_forkserver_preload(
     [
-        "tests.planned_lines", "hydra", "matplotlib.pyplot", "scipy.ndimage", "scipy.stats", "torch.utils.tensorboard",
-        "torchrl.collectors", "torchrl.data", "torchrl.envs", "torchrl.record", "torchrl.trainers.algorithms", "warp",
-        "dreamer_racing.envs", "dreamer_racing.figures.loggers", "dreamer_racing.figures.report",
+        "dreamer_racing.envs.race.pilot", "hydra", "matplotlib.pyplot", "scipy.ndimage", "scipy.stats",
+        "torch.utils.tensorboard", "torchrl.collectors", "torchrl.data", "torchrl.envs", "torchrl.record",
+        "torchrl.trainers.algorithms", "warp", "dreamer_racing.figures.loggers", "dreamer_racing.figures.report",
         "dreamer_racing.learners.latent_ppo", "dreamer_racing.training.session",
     ]
 )  # fmt: skip

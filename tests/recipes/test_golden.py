@@ -156,7 +156,5 @@ def store() -> None:
 if __name__ == "__main__":
     import os
 
-    import tests.planned_lines  # noqa: F401  # as in a session of pytest
-
     os.environ.setdefault("MUJOCO_GL", "egl")
     store()
