@@ -17,7 +17,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from dreamer_racing.envs.simulator.camera_view import is_in_view, points_in_camera
+from dreamer_racing.envs.simulator.rendering import is_in_view, points_in_camera
 from dreamer_racing.envs.simulator.scene import Camera
 from dreamer_racing.envs.tracks import Gate, Track
 from dreamer_racing.evaluation.protocol import Result, as_markdown, report_heading, results_table

@@ -11,7 +11,7 @@ from PIL import Image
 from tensordict import TensorDict
 
 from dreamer_racing.envs.drone.rotation import from_roll_pitch_yaw
-from dreamer_racing.envs.simulator.camera_view import is_in_view, points_in_camera
+from dreamer_racing.envs.simulator.rendering import is_in_view, points_in_camera
 from dreamer_racing.envs.simulator.scene import Camera
 from dreamer_racing.envs.tracks import Gate, load_track, make_track
 from dreamer_racing.envs.worlds import RaceWorlds

@@ -21,7 +21,7 @@ from dreamer_racing.envs.drone.parameters import GRAVITY, QuadrotorParameters, l
 from dreamer_racing.envs.drone.rotation import rotate, rotate_inverse, turn
 from dreamer_racing.envs.race.race import EVALUATION_TIME
 from dreamer_racing.envs.race.racing_line import Dynamics, LineLimits, Reference, plan_racing_line
-from dreamer_racing.envs.simulator.camera_view import is_in_view, points_in_camera
+from dreamer_racing.envs.simulator.rendering import is_in_view, points_in_camera
 from dreamer_racing.envs.tracks import Track, load_track
 from dreamer_racing.envs.worlds import RaceWorlds
 

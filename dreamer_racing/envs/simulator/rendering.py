@@ -1,4 +1,4 @@
-"""Rendering of M drones' nose cameras for the CPU simulator: K threads, each with a worker and a slice of the frames.
+"""Nose cameras of M drones: poses, what is in view, and images: on CPU by K threads, each with a worker and a slice.
 
 Only the camera moves: hall and gates are static, and the drone is hidden from its own camera. So a worker prepares the
 scene once, and for each frame only moves the camera and renders.
@@ -8,12 +8,13 @@ software renderer suffices); `osmesa`, the same with OSMesa, slower; `warp`, `mu
 the CPU, which needs nothing. `warp_cuda`, which `auto` does not try, casts the rays on a CUDA device in one launch
 and copies the images back.
 
-Shapes: M frames. Images are uint8 RGB (M, height, width, 3), first row at the top.
+Shapes: M frames, of one drone each, L points. Images are uint8 RGB (M, height, width, 3), first row at the top.
 """
 
 import atexit
 import copy
 import logging
+import math
 import weakref
 from collections.abc import Callable
 from concurrent.futures import Future
@@ -28,7 +29,7 @@ import mujoco
 import torch
 from torch import Tensor
 
-from dreamer_racing.envs.simulator.camera_view import NoseMount
+from dreamer_racing.envs.drone.rotation import rotate
 from dreamer_racing.envs.simulator.looks import Looks
 from dreamer_racing.envs.simulator.opengl import GL_LIBRARIES, RendererUnavailableError, open_scene, require_library
 from dreamer_racing.envs.simulator.scene import HALL_GROUP, Camera
@@ -335,3 +336,49 @@ def _worker_factory(
             raise RendererUnavailableError(f"{name} needs a CUDA device, and torch {torch.__version__} finds none.")
         return lambda: RayCaster(model, camera, frames, "cuda", varied_looks)
     raise NotImplementedError(f"{name!r} is among the renderers, but no worker here draws it: add a branch for it.")
+
+
+class NoseMount:
+    """Computes the camera poses of drones."""
+
+    def __init__(self, camera: Camera, device: torch.device | str = "cpu", dtype: torch.dtype = torch.float64) -> None:
+        self._mount = torch.tensor(camera.position, device=device, dtype=dtype)
+        self._tilt = torch.tensor([camera.tilt], device=device, dtype=dtype)
+
+    def __call__(self, position: Tensor, attitude: Tensor, tilt: Tensor | None = None) -> tuple[Tensor, Tensor]:
+        """Return the camera positions (M, 3), m, and axes (M, 3, 3) with rows right, up, backwards, in the world.
+
+        Args:
+            position: positions of the drones, (M, 3), m.
+            attitude: attitudes of the drones, (M, 4) wxyz.
+            tilt: tilts of the cameras, (M,), degrees upwards; the camera's own if None.
+        """
+        angle = torch.deg2rad(self._tilt if tilt is None else tilt)
+        cosine, sine, zero = angle.cos(), angle.sin(), torch.zeros_like(angle)
+        right = torch.stack((zero, zero - 1.0, zero), -1)
+        up, backwards = torch.stack((-sine, zero, cosine), -1), torch.stack((-cosine, zero, -sine), -1)
+        axes = torch.stack((right, up, backwards), 1).expand(len(position), -1, -1)  # (M, 3, 3) in the body frame
+        eye = position + rotate(attitude, self._mount.expand_as(position))
+        return eye, rotate(attitude.unsqueeze(1).expand(-1, 3, -1), axes)
+
+
+def points_in_camera(position: Tensor, attitude: Tensor, points: Tensor, camera: Camera) -> Tensor:
+    """Return points (M, L, 3) in the axes of drones' cameras, m: along the optical axis, to the left, and up.
+
+    Args:
+        position: positions of the drones, (M, 3), m.
+        attitude: attitudes of the drones, (M, 4) wxyz, body → world.
+        points: points in the world, (L, 3), or separate ones for each drone (M, L, 3), m.
+        camera: the nose camera.
+    """
+    eye, axes = NoseMount(camera, position.device, position.dtype)(position, attitude)
+    right, up, backwards = ((points - eye.unsqueeze(1)) @ axes.mT).unbind(-1)
+    return torch.stack((-backwards, -right, up), dim=-1)
+
+
+def is_in_view(points: Tensor, camera: Camera) -> Tensor:
+    """Return whether points (..., 3) in the camera's axes project into the image, (...) bool."""
+    up = math.tan(math.radians(camera.field_of_view) / 2)
+    left = up * camera.width / camera.height
+    depth = points[..., 0]
+    return (depth > 0) & (points[..., 1].abs() <= left * depth) & (points[..., 2].abs() <= up * depth)
