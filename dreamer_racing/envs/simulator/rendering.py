@@ -205,6 +205,8 @@ class OpenGLWorker:
 class RayCaster:
     """Worker with `mujoco_warp`'s batch renderer: thousands of cameras in one launch on a CUDA device; without OpenGL.
 
+    The hall is static, so the bounding volumes are built only once.
+
     Args:
         frames: maximum number of frames per launch.
         varied_looks: whether looks may differ between frames.

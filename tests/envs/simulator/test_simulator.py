@@ -312,7 +312,7 @@ def test_unknown_renderers_are_refused_and_those_without_a_worker_are_no_other_o
 
 
 @pytest.mark.parametrize("name", [*rendering.RENDERERS, rendering.WARP_CUDA])
-def test_every_renderer_is_in_the_table_and_has_a_worker(name: str) -> None:
+def test_every_renderer_is_in_the_docstring_and_has_a_worker(name: str) -> None:
     assert f"`{name}`" in (rendering.__doc__ or "")
     renderer_or_skip(name)
 
