@@ -15,6 +15,7 @@ import csv
 import json
 import os
 import random
+import re
 import shutil
 import signal
 import subprocess
@@ -50,7 +51,7 @@ CLOCKS = ("time/", "rate/", "wall_clock", "cpu_clock")  # columns that clocks wr
 REFUSED = 2
 HUNG = 124  # as of `timeout`
 COUNT_CALLS = """
-import atexit, io, os, signal
+import atexit, builtins, io, os, signal
 from dreamer_racing.training import checkpoint
 calls, before_a_checkpoint = 0, []
 def count(last={last}):
@@ -73,9 +74,7 @@ def save(*args, saved=checkpoint.RunCheckpoints.save, **kwargs):
     return saved(*args, **kwargs)
 checkpoint.RunCheckpoints.save = save
 if "{name}" == "open":
-    io.open = counted_open  # what pathlib calls
-    import builtins
-    builtins.open = counted_open
+    io.open = builtins.open = counted_open  # the former is what pathlib calls
 elif "{name}" == "rename":
     os.replace, os.rename = counted(os.replace), counted(os.rename)
 else:
@@ -201,11 +200,8 @@ class Arena:
         done = self._run(f"run_dir={name}", *SETTINGS, before=COUNT_CALLS.format(name="open", last=0))
         before_a_checkpoint = int(done.stdout.rpartition("calls ")[2].split()[0])
         for call in spread(range(1, before_a_checkpoint + 1), most):
-            name = self._name()
-            killed = self._run(f"run_dir={name}", *SETTINGS, before=COUNT_CALLS.format(name="open", last=call))
-            problem = "" if killed.returncode == -signal.SIGKILL else "it was not killed"
-            problem = problem or self._to_its_end(name)
-            yield self._verdict("kill early", f"after opening {call} of {before_a_checkpoint}", name, problem)
+            where, before = f"after opening {call} of {before_a_checkpoint}", COUNT_CALLS.format(name="open", last=call)
+            yield self._disturbed_verdict("kill early", where, self._name(), before=before, status=-signal.SIGKILL)
         name = self._half_way()
         again = self._run(f"run_dir={name}", *SETTINGS)
         advised = again.returncode == REFUSED and f"continue it with resume={name}" in again.stderr
@@ -220,12 +216,10 @@ class Arena:
         total = int(done.stdout.rpartition("calls ")[2].split()[-1])
         calls = spread(range(1, total + 1), most)
         for call in draw.sample(calls, len(calls)):
-            name = self._half_way()
-            before = COUNT_CALLS.format(name=function, last=call)
-            killed = self._run(f"resume={name}", TO_THE_END, before=before)
-            problem = "" if killed.returncode == -signal.SIGKILL else "it was not killed"
-            problem = problem or self._to_its_end(name)
-            yield self._verdict(f"kill at {function}", f"call {call} of {total}", name, problem)
+            where, before = f"call {call} of {total}", COUNT_CALLS.format(name=function, last=call)
+            yield self._disturbed_verdict(
+                f"kill at {function}", where, self._half_way(), before=before, status=-signal.SIGKILL
+            )
 
     def terminations(self, number: int, draw: random.Random) -> Iterator[Case]:
         """Ask a process to end at a random time; one that has ended before that is no case."""
@@ -256,39 +250,26 @@ class Arena:
         for way, file in spread([(way, file) for file in files for way in (turn, cut, Path.unlink)], most):
             name = self._half_way()
             way(latest_checkpoint(self._folder / name) / file)
-            done = self._run(f"resume={name}", TO_THE_END)
-            said = done.stdout + done.stderr
-            named = f"{newest.name} is damaged" in said or "not a complete checkpoint" in said
-            problem = trouble(done.returncode, done.stderr) or ("" if named else "the damage was not said")
-            problem = problem or ("" if "is lost" in said else "what is lost was not said")
-            yield self._verdict("damage", f"{way.__name__} {file}", name, problem)
+            named = f"{newest.name} is damaged|not a complete checkpoint"
+            yield self._disturbed_verdict("damage", f"{way.__name__} {file}", name, named, "is lost")
 
     def full_disks(self) -> Iterator[Case]:
         """Let no file grow while checkpoints are written, or ever after, from the second or from the third on."""
         for first in (1, 2):
-            for stays, what in ((False, "checkpoints"), (True, "any file")):
-                name = self._name()
-                size = 512 if stays else 4096
-                done = self._run(f"run_dir={name}", *SETTINGS, before=FULL.format(first=first, size=size, stays=stays))
-                problem = trouble(done.returncode, done.stderr, 1)
-                said = "NOT SAVED" in done.stdout and "could not be written" in done.stderr
-                problem = problem or ("" if said else "it was not said") or self._to_its_end(name)
-                yield self._verdict("full disk", f"{what}, from checkpoint {first + 1} on", name, problem)
+            for stays, size, what in ((False, 4096, "checkpoints"), (True, 512, "any file")):
+                where, words = f"{what}, from checkpoint {first + 1} on", ("NOT SAVED", "could not be written")
+                before = FULL.format(first=first, size=size, stays=stays)
+                yield self._disturbed_verdict("full disk", where, self._name(), *words, before=before, status=1)
 
     def clocks(self) -> Iterator[Case]:
         """Stop the wall clock, or let it go backwards."""
         for where, before in (("stands still", STILL), ("goes backwards", BACKWARDS)):
-            name = self._name()
-            done = self._run(f"run_dir={name}", *SETTINGS, before=before)
-            yield self._verdict("clock", where, name, trouble(done.returncode, done.stderr))
+            yield self._disturbed_verdict("clock", where, self._name(), before=before)
 
     def not_finite(self) -> Iterator[Case]:
         """Poison a reward; the run is to end, and its checkpoint to be continued without the poison."""
-        name = self._name()
-        done = self._run(f"run_dir={name}", *SETTINGS, before=INFINITE)
-        problem = trouble(done.returncode, done.stderr, 1)
-        problem = problem or ("" if "is not finite" in done.stderr else "it was not said") or self._to_its_end(name)
-        yield self._verdict("not finite", "reward", name, problem)
+        words = "is not finite"
+        yield self._disturbed_verdict("not finite", "reward", self._name(), words, before=INFINITE, status=1)
 
     def _name(self) -> str:
         self._number += 1
@@ -331,6 +312,18 @@ class Arena:
         """Begin or continue a run and let it be; return what is wrong with how it ends, or nothing."""
         done = self._run(*self._arguments(name, *settings))
         return trouble(done.returncode, done.stderr)
+
+    def _disturbed_verdict(
+        self, fault: str, where: str, name: str, *words: str, before: str = "", status: int = 0
+    ) -> Case:
+        """Begin or continue a run, disturbed by lines of Python before it, and let it come to its end; then compare.
+
+        The disturbed process must say some words, given as patterns, and end with a status; 0 is the end of the run.
+        """
+        done = self._run(*self._arguments(name), before=before)
+        unsaid = [pattern for pattern in words if not re.search(pattern, done.stdout + done.stderr)]
+        problem = trouble(done.returncode, done.stderr, status) or (f"it did not say {unsaid}" if unsaid else "")
+        return self._verdict(fault, where, name, problem or (self._to_its_end(name) if status else ""))
 
     def _verdict(self, fault: str, where: str, name: str, problem: str) -> Case:
         """Compare a run that has come to its end with the undisturbed one, and forget it unless they differ."""
@@ -398,13 +391,11 @@ def state_of(run_dir: Path) -> dict[str, Any]:
 
 def same(first: Any, second: Any) -> bool:
     """Whether two states are equal, bit for bit."""
-    if isinstance(first, torch.Tensor):
-        return torch.equal(first, second)
     if isinstance(first, dict):
         return first.keys() == second.keys() and all(same(first[key], second[key]) for key in first)
     if isinstance(first, (list, tuple)):
         return len(first) == len(second) and all(map(same, first, second))
-    return bool(first == second)
+    return torch.equal(first, second) if isinstance(first, torch.Tensor) else bool(first == second)
 
 
 def rows_of(run_dir: Path) -> list[dict[str, str]]:
