@@ -10,6 +10,7 @@ import socket
 import subprocess
 import sys
 import time
+from collections.abc import Collection
 from pathlib import Path
 from types import ModuleType
 from typing import Any, Self
@@ -99,6 +100,17 @@ def completed(name: str, *overrides: str, **given: Any) -> subprocess.CompletedP
     done = recipe(name, *overrides, **given)
     assert done.returncode == 0, done.stderr
     return done
+
+
+def python(
+    *arguments: str, cwd: Path | None = None, without: Collection[str] = (), **variables: str
+) -> subprocess.CompletedProcess[str]:
+    """Run Python on this repository, with some variables of the environment set and others unset."""
+    kept = {name: value for name, value in os.environ.items() if name not in without}
+    return subprocess.run(
+        [sys.executable, *arguments], cwd=cwd, env={**kept, "PYTHONPATH": str(ROOT), **variables},
+        capture_output=True, text=True, timeout=900, check=False,
+    )  # fmt: skip
 
 
 def build(*overrides: str, name: str = "dreamer_v3") -> None:

@@ -1,17 +1,14 @@
 """The examples, run as a user runs them, and the page that shows them."""
 
 import json
-import os
 import re
-import subprocess
-import sys
 from pathlib import Path
 
 import pytest
 
 from tests.forked import program
+from tests.running_recipes import ROOT, python
 
-ROOT = Path(__file__).parents[1]
 NOTEBOOK = ROOT / "examples" / "first_flight.ipynb"
 EXAMPLES = {path.stem: path for path in (ROOT / "examples").glob("*.py")}
 PAGE = (ROOT / "docs" / "library.md").read_text()
@@ -98,13 +95,10 @@ def cells(kind: str) -> list[str]:
 
 @pytest.mark.slow
 def test_the_notebook_flies_and_knows_where_gates_are(tmp_path: Path) -> None:
-    environment = {**os.environ, "PYTHONPATH": str(ROOT), "MPLBACKEND": "Agg", "MPLCONFIGDIR": str(tmp_path)}
-    command = [sys.executable, "-W", "ignore:FigureCanvasAgg is non-interactive", "-c", "\n".join(cells("code"))]
+    command = ["-W", "ignore:FigureCanvasAgg is non-interactive", "-c", "\n".join(cells("code"))]
     folder = NOTEBOOK.parent
     before = sorted(folder.iterdir())
-    done = subprocess.run(
-        command, cwd=folder, env=environment, capture_output=True, text=True, timeout=300, check=False
-    )
+    done = python(*command, cwd=folder, MPLBACKEND="Agg", MPLCONFIGDIR=str(tmp_path))
     assert done.returncode == 0, done.stderr
     assert sorted(folder.iterdir()) == before
     assert done.stdout.count("finished           1 (100%)") == 2, "pilot and agent fly three laps"

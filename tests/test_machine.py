@@ -4,14 +4,12 @@ from __future__ import annotations
 
 import io
 import math
-import os
 import platform
-import subprocess
 import sys
 import time
 from pathlib import Path
 from types import SimpleNamespace
-from typing import Any
+from unittest.mock import MagicMock
 
 import pytest
 import torch
@@ -26,7 +24,7 @@ from dreamer_racing.machine import (
     out_of_memory_advice,
     usable_threads,
 )
-from tests.running_recipes import ROOT, recipe_module
+from tests.running_recipes import ROOT, python, recipe_module
 
 
 def test_available_memory_is_read_from_the_kernel(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -80,7 +78,7 @@ for _ in range(40):
     torch.ones(16_000_000)
 print(resource.getrusage(resource.RUSAGE_SELF).ru_minflt - before)
 """
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    done = python("-c", code)
     assert int(done.stdout) < 100, "16 million numbers are 15,625 pages, and the last ones need no new page"
 
 
@@ -98,8 +96,8 @@ largest = resident_memory()
 del blocks[::2]
 print(kept.trim(), largest - resident_memory() > 70_000_000, kept.trim(), torch.stack(blocks).sum().item())
 """
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert done.stdout.split() == ["False", "True", "True", "False", "20000000.0"]
+    done = python("-c", code)
+    assert done.stdout.split() == ["False", "True", "True", "False", "20000000.0"], done.stderr
 
 
 def test_a_c_library_that_cannot_keep_memory_says_so(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -162,70 +160,45 @@ def test_letters_that_are_not_there_are_written_in_plainer_ones(monkeypatch: pyt
 
 @pytest.mark.parametrize("program", [["recipes/dreamer_v3.py", "--help"], ["-m", "dreamer_racing", "--help"]])
 def test_help_is_printed_under_any_locale(tmp_path: Path, program: list[str]) -> None:
-    environment = {**os.environ, "PYTHONIOENCODING": "ascii:strict", "PYTHONPATH": str(ROOT)}
-    command = [sys.executable, *(str(ROOT / word) if word.endswith(".py") else word for word in program)]
-    done = subprocess.run(command, cwd=tmp_path, env=environment, capture_output=True, timeout=120, check=False)
-    assert done.returncode == 0 and b"->" in done.stdout, done.stderr
-
-
-class Report:
-    """Flies nothing, and notes what was written."""
-
-    def __init__(self) -> None:
-        self.written: list[str] = []
-
-    def evaluate(self, deterministic: bool) -> Any:
-        return SimpleNamespace(episodes=[], summary=lambda: "σ", to_dict=dict)
-
-    def write(self, name: str, result: object) -> None:
-        self.written.append(name)
-
-    def close(self) -> None:
-        pass
-
-
-class Unread(io.StringIO):
-    """A pipe whose reader has left."""
-
-    def write(self, text: str) -> int:
-        raise BrokenPipeError(32, "Broken pipe")
+    command = [str(ROOT / word) if word.endswith(".py") else word for word in program]
+    done = python(*command, cwd=tmp_path, PYTHONIOENCODING="ascii:strict")
+    assert done.returncode == 0 and "->" in done.stdout, done.stderr
 
 
 def test_an_evaluation_is_written_though_nobody_reads(monkeypatch: pytest.MonkeyPatch) -> None:
-    report = Report()
-    monkeypatch.setattr(sys, "stdout", Unread())
+    report = MagicMock(**{"evaluate.return_value.summary.return_value": "σ"})
+    reader_has_left = MagicMock(**{"write.side_effect": BrokenPipeError(32, "Broken pipe")})
+    monkeypatch.setattr(sys, "stdout", reader_has_left)
     written = recipe_module("evaluate").evaluate_nominal(report)
-    assert list(written) == report.written == ["deterministic", "stochastic"]
+    assert list(written) == [call.args[0] for call in report.write.call_args_list] == ["deterministic", "stochastic"]
+    assert reader_has_left.write.called
 
 
 # Programs of a user whose home is not writable.
 
 
+CACHES = ("WARP_CACHE_PATH", "XDG_CACHE_HOME")
+
+
 @pytest.fixture
 def homeless(tmp_path: Path) -> dict[str, str]:
-    """An environment without a home: below a file there is no folder, whoever asks, root too."""
+    """Variables without a home: below a file there is no folder, whoever asks, root too."""
     (tmp_path / "file").write_text("")
     (tmp_path / "temporary").mkdir()
-    kept = {name: value for name, value in os.environ.items() if name not in ("WARP_CACHE_PATH", "XDG_CACHE_HOME")}
-    return {**kept, "HOME": str(tmp_path / "file" / "home"), "TMPDIR": str(tmp_path / "temporary")}
+    return {"HOME": str(tmp_path / "file" / "home"), "TMPDIR": str(tmp_path / "temporary")}
 
 
 @pytest.mark.slow
 def test_a_race_is_flown_and_it_is_said_once_and_nothing_is_left(tmp_path: Path, homeless: dict[str, str]) -> None:
     program = "import dreamer_racing.envs as envs; envs.DroneRacingEnv('circle', 2, from_pixels=False).rollout(2)"
-    done = subprocess.run(
-        [sys.executable, "-c", program], env=homeless, capture_output=True, text=True, timeout=300, check=False
-    )
+    done = python("-c", program, without=CACHES, **homeless)
     assert done.returncode == 0, done.stderr
     assert done.stderr.count("(Not a directory)") == 1 and "WARP_CACHE_PATH=FOLDER" in done.stderr
     assert list((tmp_path / "temporary").glob("dreamer_racing_*")) == []
 
 
 def test_the_doctor_says_so(tmp_path: Path, homeless: dict[str, str]) -> None:
-    done = subprocess.run(
-        [sys.executable, str(ROOT / "recipes" / "doctor.py")],
-        env=homeless, cwd=tmp_path, capture_output=True, text=True, timeout=300, check=False,
-    )  # fmt: skip
+    done = python(str(ROOT / "recipes" / "doctor.py"), cwd=tmp_path, without=CACHES, **homeless)
     (line,) = [line for line in done.stdout.splitlines() if line.startswith("caches")]
     assert "note" in line and "cannot write to" in line
     assert "Matplotlib created" not in done.stderr

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import shutil
 import subprocess
 import sys
@@ -11,16 +10,13 @@ from pathlib import Path
 import pytest
 
 from dreamer_racing import commands
-from tests.running_recipes import recipe_module
+from tests.running_recipes import ROOT, python, recipe_module
 
-ROOT = Path(__file__).parents[1]
 RECIPES = sorted(path.stem for path in (ROOT / "recipes").glob("*.py"))
 
 
 def start(*arguments: str, path: Path = ROOT, cwd: Path) -> subprocess.CompletedProcess[str]:
-    environment = os.environ | {"PYTHONPATH": str(path), "PYTHONDONTWRITEBYTECODE": "1"}
-    command = [sys.executable, "-m", "dreamer_racing", *arguments]
-    return subprocess.run(command, cwd=cwd, env=environment, capture_output=True, text=True, timeout=120, check=False)
+    return python("-m", "dreamer_racing", *arguments, cwd=cwd, PYTHONPATH=str(path), PYTHONDONTWRITEBYTECODE="1")
 
 
 @pytest.fixture(scope="module")
@@ -34,8 +30,7 @@ def installed(tmp_path_factory: pytest.TempPathFactory) -> Path:
     (source / "docs").mkdir()
     for name in ("pyproject.toml", "setup.py", "README.md", "LICENSE", "docs/options.md"):
         shutil.copy(ROOT / name, source / name)
-    command = [sys.executable, "setup.py", "-q", "build_py", "--build-lib", str(folder)]
-    done = subprocess.run(command, cwd=source, capture_output=True, text=True, timeout=120, check=False)
+    done = python("setup.py", "-q", "build_py", "--build-lib", str(folder), cwd=source)
     assert done.returncode == 0, done.stderr
     return folder
 
