@@ -6,13 +6,14 @@ import pytest
 
 from dreamer_racing.envs.drone.parameters import PRESETS
 from dreamer_racing.envs.simulator import rendering
-from dreamer_racing.envs.simulator.opengl import RendererUnavailableError
+from dreamer_racing.envs.simulator.opengl import RendererUnavailableError, loads
 from dreamer_racing.envs.simulator.rendering import RENDERERS
 from dreamer_racing.envs.simulator.scene import Camera, build_scene
 from dreamer_racing.envs.tracks import load_track
 
 IN_PROCESS = tuple(name for name in RENDERERS if name != "osmesa")
 """Those that draw side by side; PyOpenGL is bound to one platform, here EGL, for the life of a process."""
+NEEDS_EGL = pytest.mark.skipif(not loads("libEGL.so.1"), reason="EGL is not installed here")
 
 
 def renderer_or_skip(name: str) -> str:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import copy
 from itertools import pairwise
 
 import numpy as np
@@ -81,30 +80,6 @@ def test_a_new_episode_begins_with_a_frame_of_its_own_and_the_others_keep_theirs
 def test_the_randomised_noise_of_a_frame_is_held_too() -> None:
     images = flown(2, camera_rate=25.0, looks="randomised")
     assert torch.equal(images, held(images))
-
-
-def test_state_dict_goes_on_with_the_frame_that_is_shown() -> None:
-    env = DroneRacingEnv("circle", 2, camera_rate=25.0, **OPTIONS)
-    env.rollout(EVERY + 2)
-    state = copy.deepcopy(env.state_dict())
-    action = torch.from_numpy(ACTION).expand(2, 4)
-
-    def fly(env: DroneRacingEnv) -> Tensor:
-        images = []
-        for _ in range(EVERY):
-            env.worlds.step(action)
-            images.append(env.worlds.render())
-        return torch.stack(images)
-
-    other = DroneRacingEnv("circle", 2, camera_rate=25.0, **OPTIONS)
-    other.load_state_dict(state)
-    assert torch.equal(other.worlds.render(), env.worlds.render())
-    assert torch.equal(fly(other), fly(env))
-    fast = DroneRacingEnv("circle", 2, **OPTIONS)
-    with pytest.raises(ValueError, match="another camera_rate"):
-        fast.load_state_dict(state)
-    for each in (env, other, fast):
-        each.close()
 
 
 def test_every_interface_gives_the_same_frames() -> None:

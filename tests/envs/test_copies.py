@@ -4,10 +4,7 @@ from __future__ import annotations
 
 import copy
 import io
-import os
 import pickle
-import subprocess
-import sys
 from collections.abc import Callable
 from typing import Any
 
@@ -16,9 +13,11 @@ import pytest
 import torch
 from tensordict import TensorDict
 
-from dreamer_racing.envs import ControlSuiteEnv, DroneRacingEnv, load
+from dreamer_racing.envs import Camera, ControlSuiteEnv, DroneRacingEnv, load
 from dreamer_racing.envs.tracks import load_track
+from tests.running_recipes import python
 
+SMALL = Camera(16, 16)
 ENVIRONMENTS: dict[str, Callable[[], Any]] = {
     "DroneRacingEnv": lambda: DroneRacingEnv("circle", from_pixels=False),
     "gymnasium": lambda: gymnasium.make("dreamer_racing/Circle-v0", observation="vector"),
@@ -61,12 +60,20 @@ def through_a_file(state: dict) -> dict:
     return torch.load(file, weights_only=True)
 
 
-@pytest.mark.parametrize(("preset", "looks"), [("easy", None), ("faithful", None), ("faithful", "randomised")])
-def test_restored_worlds_go_on_bit_for_bit(preset: str, looks: str | None) -> None:
+@pytest.mark.parametrize(
+    "settings",
+    [
+        {"preset": "easy", "from_pixels": False},
+        {"preset": "faithful", "from_pixels": False},
+        {"preset": "faithful", "looks": "randomised"},
+        {"preset": "faithful", "camera_rate": 12.5},  # saved between two frames
+        {"preset": "faithful", "imu": "noisy"},
+    ],
+    ids=str,
+)
+def test_restored_worlds_go_on_bit_for_bit(settings: dict[str, Any]) -> None:
     def make(seed: int) -> DroneRacingEnv:
-        return DroneRacingEnv(
-            "circle", 6, from_pixels=looks is not None, preset=preset, seed=seed, episode_steps=30, looks=looks
-        )
+        return DroneRacingEnv("circle", 6, camera=SMALL, seed=seed, episode_steps=30, **settings)
 
     torch.manual_seed(0)
     env, other = make(1), make(2)
@@ -85,10 +92,23 @@ def test_restored_worlds_go_on_bit_for_bit(preset: str, looks: str | None) -> No
             assert (resets[0] == resets[1]).all()
 
 
-def test_a_state_of_another_number_of_worlds_is_refused() -> None:
-    env, other = (DroneRacingEnv("circle", n, from_pixels=False, seed=0) for n in (2, 3))
-    with pytest.raises(ValueError, match="2 worlds, but there are 3 here: resume with num_envs=2"):
+@pytest.mark.parametrize(
+    ("saved", "here", "words"),
+    [
+        ({}, {"num_envs": 3}, "2 worlds, but there are 3 here: resume with num_envs=2"),
+        ({"camera_rate": 25.0}, {}, "another camera_rate"),
+        ({"imu": "exact"}, {}, "another imu"),
+    ],
+    ids=str,
+)
+def test_a_state_of_other_worlds_is_refused(saved: dict[str, Any], here: dict[str, Any], words: str) -> None:
+    env, other = (
+        DroneRacingEnv(**{"track": "circle", "num_envs": 2, "camera": SMALL, **each}) for each in (saved, here)
+    )
+    with pytest.raises(ValueError, match=words):
         other.load_state_dict(env.state_dict())
+    for each in (env, other):
+        each.close()
 
 
 def test_a_state_of_another_device_is_refused() -> None:
@@ -138,9 +158,6 @@ for env in envs:
 @pytest.mark.slow
 def test_twenty_processes_that_close_nothing_end_with_status_zero() -> None:
     pytest.importorskip("stable_baselines3")
-    environment = {**os.environ, "OMP_NUM_THREADS": "1"}
-    done = subprocess.run(
-        [sys.executable, "-c", PROGRAM], env=environment, capture_output=True, text=True, timeout=900, check=False
-    )
+    done = python("-c", PROGRAM, OMP_NUM_THREADS="1")
     assert done.returncode == 0, done.stderr
     assert done.stdout.splitlines() == ["drawn"] * 24

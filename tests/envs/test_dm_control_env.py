@@ -25,19 +25,13 @@ from dreamer_racing.envs.simulator.opengl import RendererUnavailableError
 from dreamer_racing.envs.simulator.scene import Camera
 from dreamer_racing.envs.tracks import Track, load_track
 from dreamer_racing.envs.worlds import RaceWorlds
+from tests.renderers import NEEDS_EGL
 
 HOVER = np.array([-0.26407, 0.0, 0.0, 0.0], np.float32)
 STATE = ("position", "attitude", "linear_velocity", "body_rates")
 Policy = Callable[[int, dict[str, np.ndarray]], np.ndarray]
 
 ONE_LAP = replace(load_track("circle"), laps=1)
-
-
-def egl_or_skip() -> None:
-    try:
-        ctypes.CDLL("libEGL.so.1")
-    except OSError as error:
-        pytest.skip(f"no EGL on this machine: {error}")
 
 
 def pilot(track: Track) -> Policy:
@@ -250,9 +244,9 @@ def psnr(one: np.ndarray, other: np.ndarray) -> float:
     return 10 * np.log10(255**2 / max(error, 1e-9))
 
 
+@NEEDS_EGL
 @pytest.mark.parametrize(("renderer", "least"), [("egl", 45.0), ("warp", 26.0)])
 def test_pixels_are_those_of_the_batched_renderer(renderer: str, least: float) -> None:
-    egl_or_skip()
     env = load("kidney", random=0, from_pixels=True)
     worlds = RaceWorlds("kidney", 1, renderer=renderer)
     random = np.random.RandomState(0)
@@ -271,8 +265,8 @@ def test_pixels_are_those_of_the_batched_renderer(renderer: str, least: float) -
     worlds.close()
 
 
+@NEEDS_EGL
 def test_viewer_style_loop_renders_any_size_and_the_drone_from_outside() -> None:
-    egl_or_skip()
     env = load("kidney", random=0, from_pixels=True)
     env.reset()
     nose = env.step(HOVER).observation["pixels"]
@@ -328,10 +322,8 @@ def test_headless_backend_choice(
     assert os.environ.get("MUJOCO_GL") == chosen
 
 
-@pytest.mark.parametrize("from_pixels", [False, True])
+@pytest.mark.parametrize("from_pixels", [False, pytest.param(True, marks=NEEDS_EGL)])
 def test_torchrl_wraps_it(from_pixels: bool) -> None:
-    if from_pixels:
-        egl_or_skip()
     env = DMControlWrapper(load("circle", random=0, time_limit=0.2, from_pixels=from_pixels))
     check_env_specs(env, seed=0)
     env.set_seed(5)

@@ -9,8 +9,6 @@ import inspect
 import os
 import re
 import signal
-import subprocess
-import sys
 import traceback
 from collections.abc import Callable
 from pathlib import Path
@@ -29,7 +27,8 @@ from dreamer_racing.envs.gl_variables import VARIABLES
 from dreamer_racing.envs.policy_memory import RaceWithMemory, with_memory
 from dreamer_racing.envs.simulator.opengl import loads
 from dreamer_racing.envs.worlds import RaceWorlds, WorldOptions
-from tests.running_recipes import ROOT
+from tests.renderers import NEEDS_EGL
+from tests.running_recipes import ROOT, python
 
 IMPORTS = (ast.Import, ast.ImportFrom)
 OF_ADAPTERS = {"self", "track", "num_envs", "preset", "from_pixels"}
@@ -133,21 +132,13 @@ def test_a_forked_process_is_told_instead_of_waiting_for_ever(from_pixels: bool)
 # Variables that OpenGL's users read: none of them keeps a drone from flying, and the one in the way is named.
 
 
-def run(program: list[str], tmp_path: Path, **variables: str) -> subprocess.CompletedProcess[str]:
-    kept = {name: value for name, value in os.environ.items() if name not in VARIABLES}
-    return subprocess.run(
-        [sys.executable, *program], cwd=tmp_path, env={**kept, "PYTHONPATH": str(ROOT), **variables},
-        capture_output=True, text=True, timeout=300, check=False,
-    )  # fmt: skip
-
-
 @pytest.mark.slow
 def test_images_are_drawn_whatever_mujoco_gl_says(tmp_path: Path) -> None:
     value = "no_such_thing" if loads("libOSMesa.so.8") else "osmesa"
     program = (
         "from dreamer_racing.envs import DroneRacingEnv; print(DroneRacingEnv('circle', 1).reset()['pixels'].shape)"
     )
-    done = run(["-c", program], tmp_path, MUJOCO_GL=value)
+    done = python("-c", program, cwd=tmp_path, without=VARIABLES, MUJOCO_GL=value)
     assert done.returncode == 0 and "64" in done.stdout, done.stderr
     assert done.stderr.count(f"MUJOCO_GL={value} is ignored") == 1
 
@@ -155,7 +146,7 @@ def test_images_are_drawn_whatever_mujoco_gl_says(tmp_path: Path) -> None:
 def test_a_training_begins_whatever_mujoco_gl_says(tmp_path: Path) -> None:
     """TorchRL imports MuJoCo, too. What is refused here is refused once all is imported."""
     program = [str(ROOT / "recipes" / "dreamer_v3.py"), "model=debug", "total_env_steps=1"]
-    done = run(program, tmp_path, MUJOCO_GL="no_such_thing")
+    done = python(*program, cwd=tmp_path, without=VARIABLES, MUJOCO_GL="no_such_thing")
     assert done.returncode == 2 and "Traceback" not in done.stderr and "prefill" in done.stderr, done.stderr
     assert done.stderr.count("MUJOCO_GL=no_such_thing is ignored") == 1
 
@@ -170,24 +161,22 @@ def test_whatever_imports_torchrl_has_heeded_the_variable_before() -> None:
         assert ast.unparse(first) == "import dreamer_racing.envs", folder
 
 
+@NEEDS_EGL
 @pytest.mark.parametrize(
     ("name", "value"), [("MUJOCO_GL", "no_such_thing"), ("PYOPENGL_PLATFORM", "glx"), ("MUJOCO_EGL_DEVICE_ID", "one")]
 )
 def test_the_doctor_names_the_variable_and_no_package_that_is_there(tmp_path: Path, name: str, value: str) -> None:
-    if not loads("libEGL.so.1"):
-        pytest.skip("EGL is not installed here")
-    done = run([str(ROOT / "recipes" / "doctor.py")], tmp_path, **{name: value})
+    done = python(str(ROOT / "recipes" / "doctor.py"), cwd=tmp_path, without=VARIABLES, **{name: value})
     assert f"unset {name}" in done.stdout and f"{name}={value}" in done.stdout
     assert "Traceback" not in done.stderr and "apt-get install libegl1" not in done.stdout
 
 
+@NEEDS_EGL
 @pytest.mark.slow
 @pytest.mark.parametrize("word", ["", "no_such_thing"])  # where there is no word, dm_control_gl chooses egl
 def test_dm_control_draws_whatever_pyopengl_platform_says(tmp_path: Path, word: str) -> None:
-    if not loads("libEGL.so.1"):
-        pytest.skip("EGL is not installed here")
     program = "from dreamer_racing.envs import load; print(load('circle', from_pixels=True).reset().observation.keys())"
-    done = run(["-c", program], tmp_path, MUJOCO_GL=word, PYOPENGL_PLATFORM="glx")
+    done = python("-c", program, cwd=tmp_path, without=VARIABLES, MUJOCO_GL=word, PYOPENGL_PLATFORM="glx")
     assert done.returncode == 0 and "pixels" in done.stdout, done.stderr
     assert done.stderr.count("PYOPENGL_PLATFORM=glx is ignored") == 1
 
@@ -256,6 +245,7 @@ def assert_same_flights(ours: EnvBase, stock: EnvBase) -> None:
         {},
         {"privileged": True},
         {"looks": "randomised"},
+        {"imu": "noisy"},
     ],
     ids=str,
 )
