@@ -14,6 +14,8 @@ from dreamer_racing.envs.race.gates import CrashCause
 from tests.envs.test_gym_env import HOVER, IDS, INFO, make_vec
 
 CLIMB = np.array([0.5, 0.0, 0.0, 0.0], np.float32)
+HOVERING = np.tile(HOVER, (3, 1))
+POISONED = np.stack((HOVER, np.full(4, np.nan, np.float32), HOVER))  # the second one crashes: not finite
 
 
 def test_a_partial_reset_needs_a_full_reset_first() -> None:
@@ -61,22 +63,19 @@ def test_frames_look_as_what_is_seen() -> None:
 def test_autoreset_begins_an_episode_in_the_step_after_its_end() -> None:
     envs = make_vec(observation="both", evaluation=True, max_episode_steps=4)
     start, _ = envs.reset(seed=0)
-    hover = np.tile(HOVER, (3, 1))
-    poisoned = hover.copy()
-    poisoned[1] = np.nan
-    _, reward, terminated, _, info = envs.step(poisoned)
+    _, reward, terminated, _, info = envs.step(POISONED)
     assert list(terminated) == [False, True, False]
     assert list(info["crash"]) == [CrashCause.NONE, CrashCause.INVALID_ACTION, CrashCause.NONE]
     assert reward[1] == -4.0
 
-    observation, reward, terminated, _, info = envs.step(poisoned)  # its action does not matter now
+    observation, reward, terminated, _, info = envs.step(POISONED)  # its action does not matter now
     assert not terminated.any()
     assert reward[1] == 0.0
     assert info["crash"][1] == CrashCause.NONE
     np.testing.assert_array_equal(observation["position"][1], start["position"][1])
     np.testing.assert_array_equal(observation["pixels"][1], start["pixels"][1])
 
-    ends = [envs.step(hover)[2:5] for _ in range(4)]
+    ends = [envs.step(HOVERING)[2:5] for _ in range(4)]
     # two steps more end the undisturbed ones; the other has had an episode's first observation in between
     assert [list(end[1]) for end in ends] == [
         [False, False, False],
@@ -93,7 +92,7 @@ def test_reset_forgets_pending_autoresets() -> None:
     envs.reset()
     envs.step(np.full((3, 4), np.nan))
     envs.reset()
-    observation, *_ = envs.step(np.tile(np.array([0.5, 0, 0, 0]), (3, 1)))
+    observation, *_ = envs.step(np.tile(CLIMB, (3, 1)))
     assert (observation["linear_velocity"][:, 2] > 0.0).all()
 
 
@@ -111,13 +110,6 @@ def test_every_mode_of_make_vec(mode: str | None, kind: type) -> None:
     envs.close()
 
 
-def poisoned(num_envs: int, index: int) -> np.ndarray:
-    """Hovering, but for one, which crashes by an action that is not finite."""
-    actions = np.tile(HOVER, (num_envs, 1))
-    actions[index] = np.nan
-    return actions
-
-
 @pytest.mark.parametrize("observation", ["vector", "both"])
 def test_in_mode_same_step_the_last_observation_is_in_info(observation: str) -> None:
     envs = make_vec(observation=observation, autoreset_mode="SameStep", evaluation=True)
@@ -132,7 +124,7 @@ def test_in_mode_same_step_the_last_observation_is_in_info(observation: str) -> 
     assert not np.allclose(of(last)[0], of(start)[0])  # flies on
     np.testing.assert_allclose(of(last)[1], of(start)[1], atol=1e-6)  # at the start again: evaluation
     assert not np.allclose(of(info["final_obs"][1]), of(start)[1], atol=1e-6)
-    assert "final_obs" not in envs.step(np.tile(HOVER, (3, 1)))[-1]
+    assert "final_obs" not in envs.step(HOVERING)[-1]
     envs.close()
 
 
@@ -174,8 +166,8 @@ def test_in_mode_same_step_only_the_images_of_new_episodes_are_drawn_again(
 def make_and_poison(envs: DroneRaceVectorEnv) -> tuple:
     """Fly a little, then let the second one crash."""
     for _ in range(3):
-        envs.step(np.tile(HOVER + CLIMB, (3, 1)))
-    return envs.step(poisoned(3, 1))
+        envs.step(HOVERING + CLIMB)
+    return envs.step(POISONED)
 
 
 def test_in_mode_disabled_episodes_begin_where_they_are_reset() -> None:
@@ -183,23 +175,25 @@ def test_in_mode_disabled_episodes_begin_where_they_are_reset() -> None:
     start, _ = envs.reset(seed=0)
     last, _, terminated, _, _ = make_and_poison(envs)
     with pytest.raises(gymnasium.error.ResetNeeded, match=r"Episodes \[1\] have ended"):
-        envs.step(np.tile(HOVER, (3, 1)))
+        envs.step(HOVERING)
     observation, info = envs.reset(options={"reset_mask": terminated})
     np.testing.assert_allclose(observation[1], start[1], atol=1e-6)
     np.testing.assert_array_equal(observation[[0, 2]], last[[0, 2]])  # they did not notice
     assert list(info["_crash"]) == [False, True, False]
-    assert not envs.step(np.tile(HOVER, (3, 1)))[2].any()
+    assert not envs.step(HOVERING)[2].any()
     for mask in (np.zeros(3, bool), np.ones(2, bool), [True, True, True]):
         with pytest.raises(ValueError, match="reset_mask="):
             envs.reset(options={"reset_mask": mask})
     envs.close()
 
 
-def test_unknown_modes_and_lengths_that_are_no_numbers_are_refused() -> None:
+def test_unknown_modes_and_lengths_or_seeds_that_are_no_numbers_are_refused() -> None:
     with pytest.raises(ValueError, match="autoreset_mode='never': choose one of 'NextStep', 'SameStep', 'Disabled'"):
         make_vec(autoreset_mode="never")
     with pytest.raises(ValueError, match="max_episode_steps='300': must be a whole number"):
         make_vec(max_episode_steps="300", episode_steps=200)
+    with pytest.raises(ValueError, match="seed=\\[1, 2, 3\\]: must be one number"):
+        make_vec(observation="state").reset(seed=[1, 2, 3])
 
 
 @pytest.mark.parametrize(

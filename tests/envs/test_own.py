@@ -132,15 +132,6 @@ def test_gymnasium_and_dm_control_take_them() -> None:
         gymnasium.make("dreamer_racing/Circle-v0", observation="state", vector=own["vector"])
 
 
-def test_worlds_go_on_where_they_were_saved() -> None:
-    worlds, _ = fly(reward=OWN["smooth"])
-    state = worlds.state_dict()
-    other = RaceWorlds("circle", **SMALL, reward=OWN["smooth"])
-    other.reset()
-    other.load_state_dict(state)
-    assert torch.equal(worlds.step(ACTIONS[0]).reward_base, other.step(ACTIONS[0]).reward_base)
-
-
 class Constant:
     """A class whose objects are called."""
 

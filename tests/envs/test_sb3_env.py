@@ -5,7 +5,6 @@ import numpy as np
 import pytest
 
 from dreamer_racing import GYM_ENVIRONMENTS
-from dreamer_racing.envs.drone.parameters import QuadrotorParameters
 from dreamer_racing.envs.race.gates import CrashCause
 
 pytest.importorskip("stable_baselines3", reason="needs the extra `sb3`: pip install -e '.[sb3]'")
@@ -17,8 +16,8 @@ from stable_baselines3.common.evaluation import evaluate_policy
 from stable_baselines3.common.vec_env import SubprocVecEnv, VecMonitor
 
 from dreamer_racing.envs.sb3_env import DroneRaceVecEnv
+from tests.envs.test_gym_env import HOVER
 
-HOVER = np.array([QuadrotorParameters().hover_action, 0.0, 0.0, 0.0], np.float32)
 FALL = np.array([-1.0, 0.0, 0.0, 0.0], np.float32)
 POLICIES = {"vector": "MlpPolicy", "pixels": "CnnPolicy", "state": "MultiInputPolicy", "both": "MultiInputPolicy"}
 
@@ -83,19 +82,6 @@ def test_out_of_time_is_told_from_a_crash() -> None:
     assert [list(ended) for ended, _ in steps] == [[False, False]] * 2 + [[True, True], [False, False]]
     assert [infos[0]["TimeLimit.truncated"] for _, infos in steps] == [False, False, True, False]
     assert steps[2][1][1]["terminal_observation"].shape == (21,)
-
-
-def test_it_flies_as_single_environments_do() -> None:
-    env, single = vec_env(1, "state"), gymnasium.make("dreamer_racing/Circle-v0", observation="state")
-    env.seed(4)
-    observation, (expected, _) = env.reset(), single.reset(seed=4)
-    rng = np.random.default_rng(0)
-    for _ in range(10):
-        np.testing.assert_array_equal(observation["position"][0], expected["position"])
-        action = rng.uniform(-0.5, 0.5, (1, 4)).astype(np.float32)
-        observation, rewards, _, _ = env.step(action)
-        expected, reward, *_ = single.step(action[0])
-        assert rewards[0] == np.float32(reward)
 
 
 def test_seeds_reproduce_until_the_next_reset() -> None:

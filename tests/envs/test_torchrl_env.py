@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 import torch
 from tensordict import TensorDict
-from torchrl.collectors import Collector
 from torchrl.envs.utils import check_env_specs
 
 from dreamer_racing.envs.drone.parameters import QuadrotorParameters
@@ -84,16 +83,6 @@ def test_seeds_reproduce_and_differ() -> None:
     assert torch.equal(first, fly(0))
     assert not torch.allclose(first, fly(1))
     assert not torch.allclose(first[:, 0], first[:, 5])
-
-
-def test_set_seed_starts_over() -> None:
-    env = blind()
-    starts = []
-    for _ in range(2):
-        env.set_seed(11)
-        starts.append(env.reset()["privileged", "position"])
-    assert torch.equal(*starts)
-    assert not torch.equal(starts[0], env.reset()["privileged", "position"])
 
 
 def test_time_limit_truncates_and_nothing_else() -> None:
@@ -216,24 +205,6 @@ def test_actions_beyond_the_bounds_are_clipped() -> None:
         data = env.reset().set("action", scale * torch.tensor([[1.0, -1.0, 1.0, 1.0]]).repeat(3, 1))
         ends.append(env.step(data)["next", "privileged", "attitude"])
     assert torch.equal(*ends)
-
-
-def test_collector_resets_by_itself() -> None:
-    env = DroneRacingEnv("circle", 4, seed=0, episode_steps=5)
-    collector = Collector(env, hover, frames_per_batch=48, total_frames=96)
-    batches = list(collector)
-    collector.shutdown()
-    assert [batch.shape for batch in batches] == [(4, 12)] * 2
-    data = torch.cat(batches, dim=1)
-    done = data["next", "done"][..., 0]
-    assert done.sum() >= 4 * 4
-    # after an end the next record is a first observation; else it is the one that was arrived at
-    position, arrived = data["privileged", "position"], data["next", "privileged", "position"]
-    continued = (position[:, 1:] == arrived[:, :-1]).all(-1)
-    assert torch.equal(continued, ~done[:, :-1])
-    pixels = (data["pixels"][:, 1:] == data["next", "pixels"][:, :-1]).flatten(2).all(-1)
-    assert pixels[~done[:, :-1]].all()
-    assert not data["reward_base"][:, 1:][done[:, :-1]].any()
 
 
 @pytest.mark.parametrize(
