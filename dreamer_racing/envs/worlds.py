@@ -278,17 +278,9 @@ class RaceWorlds:
     def _make_starts(self, beyond_gate: float, at_gate: float, noise: float, on_line: float) -> StartSampler:
         """Make the sampler of start poses, and plan the racing line if episodes begin on it."""
         on_line = 0.0 if self.evaluation else on_line
-        nominal = without_randomisation(self.parameters)
+        line = plan_racing_line(self.track, without_randomisation(self.parameters), START_LINE) if on_line else None
         return StartSampler(
-            self.track,
-            self._generator,
-            self.device,
-            self.dtype,
-            beyond_gate,
-            noise,
-            on_line,
-            plan_racing_line(self.track, nominal, START_LINE) if on_line else None,
-            at_gate,
+            self.track, self._generator, self.device, self.dtype, beyond_gate, noise, on_line, line, at_gate
         )
 
     @property
@@ -484,16 +476,16 @@ class RaceWorlds:
         """Return the observation `vector`, float32 (N, V): the user-defined function's, or the race vector."""
         return self.vector() if self.custom_vector is None else self.custom_vector.vector(self.race_state())
 
+    def _parts(self) -> dict[str, Any]:
+        """Return what has a state of its own, by its key in `state_dict`."""
+        parts = {"simulator": self.simulator, "race": self.race, "frames": self._held, "imu": self.imu}
+        return {name: part for name, part in parts.items() if part is not None}
+
     def state_dict(self) -> dict[str, Any]:
         """Return the complete state that future steps and episodes depend on, for `torch.save`."""
-        return {
-            "simulator": self.simulator.state_dict(),
-            "race": self.race.state_dict(),
-            "generator": self._generator.get_state(),
-            **({"last_action": self._last_action.clone()} if self._tracks_last_action else {}),
-            **({} if self._held is None else {"frames": self._held.state_dict()}),
-            **({} if self.imu is None else {"imu": self.imu.state_dict()}),
-        }
+        last_action = {"last_action": self._last_action.clone()} if self._tracks_last_action else {}
+        states = {name: part.state_dict() for name, part in self._parts().items()}
+        return {**states, "generator": self._generator.get_state(), **last_action}
 
     def load_state_dict(self, state_dict: Mapping[str, Any]) -> None:
         """Restore what `state_dict` returned.
@@ -506,10 +498,10 @@ class RaceWorlds:
             raise ValueError(
                 f"The saved state has {saved} worlds, but there are {self.num_envs} here: resume with num_envs={saved}."
             )
-        if ("frames" in state_dict) != (self._held is not None):
-            raise ValueError("The saved worlds had another camera_rate: resume with the same one.")
-        if ("imu" in state_dict) != (self.imu is not None):
-            raise ValueError("The saved worlds had another imu: resume with the same one.")
+        parts = self._parts()
+        for name, setting in (("frames", "camera_rate"), ("imu", "imu")):
+            if (name in state_dict) != (name in parts):
+                raise ValueError(f"The saved worlds had another {setting}: resume with the same one.")
         if self._tracks_last_action and "last_action" in state_dict:
             self._last_action.copy_(state_dict["last_action"])
         self.has_reset = True
@@ -520,13 +512,9 @@ class RaceWorlds:
                 f"The saved worlds were on {saved_on}, these are on {self.device.type}, where random numbers "
                 f"differ: resume with device={saved_on} (of the worlds; in recipes env.device={saved_on})."
             )
-        self.simulator.load_state_dict(state_dict["simulator"])
-        self.race.load_state_dict(state_dict["race"])
+        for name, part in parts.items():
+            part.load_state_dict(state_dict[name])
         self._images = None
-        if self._held is not None:
-            self._held.load_state_dict(state_dict["frames"])
-        if self.imu is not None:
-            self.imu.load_state_dict(state_dict["imu"])
         self._generator.set_state(generator)
 
     def __reduce_ex__(self, protocol: Any) -> Any:
