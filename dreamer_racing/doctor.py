@@ -74,6 +74,10 @@ class Diagnosis(NamedTuple):
     remedy: str = ""
 
 
+def _judge(what: str, fine: bool, found: str, remedy: str, otherwise: Verdict = Verdict.wrong) -> Diagnosis:
+    return Diagnosis(what, Verdict.fine, found) if fine else Diagnosis(what, otherwise, found, remedy)
+
+
 def examine(capacity: int, keep: int, run_dir: Path) -> Iterator[Diagnosis]:
     """Yield the results of all checks, for a replay of ``capacity`` records and ``keep`` checkpoints in ``run_dir``."""
     probes = {backend: _start_probe(backend) for backend in GL_LIBRARIES}
@@ -90,10 +94,8 @@ def examine(capacity: int, keep: int, run_dir: Path) -> Iterator[Diagnosis]:
 
 def python() -> Diagnosis:
     """Check the version of the Python interpreter."""
-    wanted = importlib.metadata.metadata(DISTRIBUTION)["Requires-Python"]
-    fits = platform.python_version() in SpecifierSet(wanted)
-    remedy = "" if fits else f"PYTHON=/path/to/python{wanted} ./dev ..."
-    return Diagnosis("python", Verdict.fine if fits else Verdict.wrong, platform.python_version(), remedy)
+    wanted, found = importlib.metadata.metadata(DISTRIBUTION)["Requires-Python"], platform.python_version()
+    return _judge("python", found in SpecifierSet(wanted), found, f"PYTHON=/path/to/python{wanted} ./dev ...")
 
 
 def packages() -> Iterator[Diagnosis]:
@@ -109,9 +111,8 @@ def packages() -> Iterator[Diagnosis]:
         if extra:
             extras.setdefault(extra[1], []).extend([] if fits else [str(requirement)])
         elif not fits or requirement.name in SHOWN:
-            wanted = f"pip install '{requirement.name}{requirement.specifier}'"
-            state = Verdict.fine if fits else Verdict.wrong
-            yield Diagnosis(requirement.name, state, found or "not installed", "" if fits else wanted)
+            remedy = f"pip install '{requirement.name}{requirement.specifier}'"
+            yield _judge(requirement.name, fits, found or "not installed", remedy)
     complete = sorted(extra for extra, missing in extras.items() if not missing)
     absent = sorted(extra for extra, missing in extras.items() if missing)
     remedy = f"for {', '.join(absent)}: {install_extra('NAME')}" if absent else ""
@@ -161,16 +162,14 @@ def cuda_of_torch() -> str | None:
 def cores() -> Iterator[Diagnosis]:
     """Check the CPU cores, their load, the number of threads of torch, and bfloat16 instructions."""
     available, load = available_cpus(), os.getloadavg()[0]
-    busy = load > 0.5 * available
     remedy = "other processes slow a training down; two trainings need OMP_NUM_THREADS=1 each"
-    found = f"{available}, load {load:.1f}"
-    yield Diagnosis("cores", Verdict.note if busy else Verdict.fine, found, remedy if busy else "")
+    yield _judge("cores", load <= 0.5 * available, f"{available}, load {load:.1f}", remedy, Verdict.note)
     threads = os.environ.get("OMP_NUM_THREADS")
     outside = (threads or "").partition(",")[0].strip()  # outer number of "4,2"
     too_many = outside.isdecimal() and int(outside) > available
     found = f"OMP_NUM_THREADS={threads}" if threads else "as many as cores"
-    remedy = f"OMP_NUM_THREADS={available}: more threads than cores wait for each other" if too_many else ""
-    yield Diagnosis("threads", Verdict.wrong if too_many else Verdict.fine, found, remedy)
+    remedy = f"OMP_NUM_THREADS={available}: more threads than cores wait for each other"
+    yield _judge("threads", not too_many, found, remedy)
     flags = Path("/proc/cpuinfo").read_text(encoding="utf-8") if Path("/proc/cpuinfo").exists() else ""
     bfloat16 = [name for name in ("amx_bf16", "avx512_bf16") if name in flags]
     found = f"{', '.join(bfloat16)}: a training measures whether this is faster" if bfloat16 else ""
@@ -183,8 +182,7 @@ def memory(needed: float) -> Diagnosis:
     if free == math.inf:
         return Diagnosis("memory", Verdict.note, f"a default run takes {needed / 1e9:.1f} GB")
     found = f"{free / 1e9:.1f} GB free, such a run takes {needed / 1e9:.1f}"
-    remedy = "lower replay.capacity=, or replay.storage=memmap"
-    return Diagnosis("memory", *_enough(found, free >= needed, remedy))
+    return _judge("memory", free >= needed, found, "lower replay.capacity=, or replay.storage=memmap")
 
 
 def disk(needed: float, run_dir: Path) -> Diagnosis:
@@ -194,7 +192,7 @@ def disk(needed: float, run_dir: Path) -> Diagnosis:
         return Diagnosis("disk", Verdict.wrong, f"cannot write to {place} ({reason})", "choose another run_dir=")
     free = shutil.disk_usage(place).free
     found = f"{free / 1e9:.1f} GB free at {run_dir}, checkpoints of such a run take about {needed / 1e9:.1f}"
-    return Diagnosis("disk", *_enough(found, free >= needed, "lower checkpoint.keep= or choose another run_dir="))
+    return _judge("disk", free >= needed, found, "lower checkpoint.keep= or choose another run_dir=")
 
 
 def caches() -> Diagnosis:
@@ -203,10 +201,6 @@ def caches() -> Diagnosis:
         remedy = "WARP_CACHE_PATH=FOLDER, or a writable HOME; until then every program compiles again"
         return Diagnosis("caches", Verdict.note, reason, remedy)
     return Diagnosis("caches", Verdict.fine, str(warp_cache()))
-
-
-def _enough(found: str, enough: bool, remedy: str) -> tuple[Verdict, str, str]:
-    return (Verdict.fine, found, "") if enough else (Verdict.wrong, found, remedy)
 
 
 def renderers(probes: dict[str, subprocess.Popen[str]]) -> Iterator[Diagnosis]:
