@@ -138,34 +138,27 @@ def test_time_limit_truncates_and_the_next_step_begins_an_episode() -> None:
     assert env.physics.time() == 0.0
 
 
-def test_crash_in_the_last_step_is_a_crash() -> None:
-    env = load("circle", evaluation=True, time_limit=0.02)
+@pytest.mark.parametrize(
+    ("time_limit", "action", "spin", "cause"),
+    [
+        (None, np.array([0.0, np.inf, 0.0, 0.0]), 0.0, CrashCause.INVALID_ACTION),
+        (0.02, np.full(4, np.nan), 0.0, CrashCause.INVALID_ACTION),  # in the last step
+        (None, HOVER, 1e200, CrashCause.NON_FINITE_STATE),
+    ],
+)
+def test_what_is_not_finite_is_a_crash_and_not_an_exception(
+    time_limit: float | None, action: np.ndarray, spin: float, cause: CrashCause
+) -> None:
+    env = load("circle", random=0, time_limit=time_limit)
     env.reset()
-    time_step = env.step(np.full(4, np.nan))
-    assert time_step.last()
-    assert time_step.discount == 0.0
-
-
-def test_action_that_is_not_finite_is_a_crash() -> None:
-    env = load("circle", random=0)
-    env.reset()
-    time_step = env.step(np.array([0.0, np.inf, 0.0, 0.0]))
-    assert time_step.last()
-    assert (time_step.discount, time_step.reward) == (0.0, -4.0)
-    assert env.task.outcome.crash.item() == CrashCause.INVALID_ACTION
-    assert all(np.isfinite(values).all() for values in time_step.observation.values())
-    assert not env.reset().last()
-
-
-def test_diverged_physics_is_a_crash_and_not_an_exception() -> None:
-    env = load("circle", random=0)
-    env.reset()
-    env.physics.data.qvel[3:] = 1e200
-    time_step = env.step(HOVER)
+    env.physics.data.qvel[3:] += spin
+    time_step = env.step(action)
     assert (time_step.last(), time_step.discount, time_step.reward) == (True, 0.0, -4.0)
-    assert env.task.outcome.crash.item() == CrashCause.NON_FINITE_STATE
-    assert np.isfinite(env.reset().observation["position"]).all()
-    assert not env.step(HOVER).last()
+    assert env.task.outcome.crash.item() == cause
+    assert spin or all(np.isfinite(values).all() for values in time_step.observation.values())
+    begun = env.reset()
+    assert not begun.last() and np.isfinite(begun.observation["position"]).all()
+    assert env.step(HOVER).discount == 1.0
 
 
 def test_actions_of_another_shape_or_type_are_refused() -> None:
