@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import subprocess
 import sys
 import warnings
 from collections.abc import Callable
@@ -29,6 +28,7 @@ from dreamer_racing.envs.simulator.opengl import RendererUnavailableError
 from dreamer_racing.envs.torchrl_env import DroneRacingEnv
 from dreamer_racing.envs.tracks import load_track
 from dreamer_racing.envs.worlds import RaceWorlds
+from tests.running_recipes import python
 
 IDS = [f"dreamer_racing/{name}-v0" for name in dreamer_racing.GYM_ENVIRONMENTS]
 HOVER = np.array([QuadrotorParameters().hover_action, 0.0, 0.0, 0.0], np.float32)
@@ -96,8 +96,8 @@ def test_importing_the_package_registers_and_is_cheap() -> None:
         "import dreamer_racing; print(sorted(m for m in ('torch', 'mujoco', 'torchrl') if m in sys.modules), "
         "sum(i.startswith('dreamer_racing/') for i in gymnasium.registry))"
     )
-    ran = subprocess.run([sys.executable, "-W", "error", "-c", code], capture_output=True, text=True, check=True)
-    assert ran.stdout.split() == ["[]", str(len(IDS))]
+    ran = python("-W", "error", "-c", code)
+    assert ran.stdout.split() == ["[]", str(len(IDS))], ran.stderr
 
 
 @pytest.mark.parametrize("make", [gymnasium.make, gymnasium.make_vec])
