@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import torch
 from tensordict import TensorDict
+from torchrl.collectors import Collector
 from torchrl.envs.utils import check_env_specs
 
 import dreamer_racing.envs.control_suite as dmc_module
@@ -316,6 +317,17 @@ def test_state_of_another_task_is_refused() -> None:
     state = blind(num_envs=2).state_dict()
     with pytest.raises(ValueError, match="has 2 world.* of cartpole_swingup, but this environment has 3 of walker"):
         blind("walker_walk", 3).load_state_dict(state)
+
+
+def test_collector_resets_by_itself() -> None:
+    env = blind(num_envs=2, action_repeat=250)
+    collector = Collector(env, env.rand_action, frames_per_batch=20, total_frames=20)
+    data = next(iter(collector))
+    done = data["next", "done"][..., 0]
+    assert done.tolist() == [[step % 4 == 3 for step in range(10)]] * 2
+    continued = (data["vector"][:, 1:] == data["next", "vector"][:, :-1]).all(-1)
+    assert torch.equal(continued, ~done[:, :-1])
+    collector.shutdown()
 
 
 def test_closing_twice_is_safe(opengl: None) -> None:

@@ -84,6 +84,19 @@ def test_out_of_time_is_told_from_a_crash() -> None:
     assert steps[2][1][1]["terminal_observation"].shape == (21,)
 
 
+def test_it_flies_as_single_environments_do() -> None:
+    env, single = vec_env(1, "state"), gymnasium.make("dreamer_racing/Circle-v0", observation="state")
+    env.seed(4)
+    observation, (expected, _) = env.reset(), single.reset(seed=4)
+    rng = np.random.default_rng(0)
+    for _ in range(10):
+        np.testing.assert_array_equal(observation["position"][0], expected["position"])
+        action = rng.uniform(-0.5, 0.5, (1, 4)).astype(np.float32)
+        observation, rewards, _, _ = env.step(action)
+        expected, reward, *_ = single.step(action[0])
+        assert rewards[0] == np.float32(reward)
+
+
 def test_seeds_reproduce_until_the_next_reset() -> None:
     def starts(seed: int) -> np.ndarray:
         env = vec_env()

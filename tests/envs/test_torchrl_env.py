@@ -85,6 +85,16 @@ def test_seeds_reproduce_and_differ() -> None:
     assert not torch.allclose(first[:, 0], first[:, 5])
 
 
+def test_set_seed_starts_over() -> None:
+    env = blind()
+    starts = []
+    for _ in range(2):
+        env.set_seed(11)
+        starts.append(env.reset()["privileged", "position"])
+    assert torch.equal(*starts)
+    assert not torch.equal(starts[0], env.reset()["privileged", "position"])
+
+
 def test_time_limit_truncates_and_nothing_else() -> None:
     env = blind(evaluation=True, episode_steps=4)
     data = env.rollout(4, hover, break_when_any_done=False)
