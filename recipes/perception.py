@@ -113,8 +113,7 @@ def write(
 ) -> None:
     """Write numbers, tables and the plot; `corrupted` maps the noise of starts to flights with corrupted images."""
     title = f"{provenance['algorithm']} on {provenance['track']}, {provenance['env_steps']:,} env_steps"
-    flights = {name: (kind.track, kind.trajectory, kind.sights) for name, kind in looked.items()}
-    plot_sight(flights, camera, directory / "perception.png", title)
+    plot_sight(looked, camera, directory / "perception.png", title)
     (directory / "perception.md").write_text(sight_report(title, looked, corrupted, provenance), encoding="utf-8")
     numbers = {
         "flights": {name: kind.to_dict() for name, kind in looked.items()},

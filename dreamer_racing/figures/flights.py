@@ -23,7 +23,10 @@ from dreamer_racing.figures.drawing import (
     BOX,
     GATE_COLOR,
     INK,
+    altitude_legend,
+    draw_altitude,
     draw_flight,
+    draw_speed,
     draw_speed_scale,
     draw_track,
     dress_map,
@@ -32,7 +35,6 @@ from dreamer_racing.figures.drawing import (
     speed_scale,
 )
 from dreamer_racing.figures.film import CONTEXT_COLOR, OPEN_LOOP_COLOR, STRIP_FRAMES, film_strip, shown_frames
-from dreamer_racing.figures.profiles import altitude_legend, draw_altitude, draw_speed
 
 COLUMNS = 3  # of several flights or tracks
 CELL = (5.0, 5.6)  # width and height per track, inches
@@ -90,8 +92,8 @@ def draw_track_side(axes: Axes, track: Track) -> None:
             z += 0.3  # above the number of another gate at the same place
         labels.append((x, z))
         axes.text(x, z, str(number), ha="center", va="center", fontsize=9, color=INK, bbox=BADGE, zorder=7)
-    axes.set(xlabel="x (m)", ylim=(min(z_low, 0.0) - 0.2, z_high + 0.2))
-    dress_map(axes, "z (m)")
+    axes.set(xlabel="x (m)", ylabel="z (m)", ylim=(min(z_low, 0.0) - 0.2, z_high + 0.2))
+    dress_map(axes)
 
 
 def plot_tracks(tracks: Sequence[Track], path: str | Path) -> None:

@@ -24,10 +24,10 @@ from dreamer_racing.figures.curves import (
     wanted_columns,
     write_curves,
 )
+from dreamer_racing.figures.drawing import PROFILE_AXES
 from dreamer_racing.figures.film import dream_video, write_gif, write_video
 from dreamer_racing.figures.flights import NamedFlight, plot_dreams, plot_flights
 from dreamer_racing.figures.learning import plot_comparison, plot_learning_curves
-from dreamer_racing.figures.profiles import PROFILE_AXES
 from dreamer_racing.figures.runs import RunData, find_runs, first_of_each_curve, group_runs, read_runs
 from dreamer_racing.settings import NOT_NEGATIVE, check_choice, check_settings, setting
 from dreamer_racing.training.directory import RunDirectory, ensure_writable

@@ -12,14 +12,14 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator, PercentFormatter
 
 from dreamer_racing.envs.simulator.scene import Camera
-from dreamer_racing.envs.tracks import Track
-from dreamer_racing.evaluation.evaluate import CRASHES, FINISHED, Episode, Evaluation, Trajectory
+from dreamer_racing.evaluation.evaluate import CRASHES, FINISHED, Episode, Evaluation
 from dreamer_racing.evaluation.protocol import CONDITIONS, MODES, PRESETS, Result, report_heading, results_table
-from dreamer_racing.evaluation.sight import BIN_DEGREES, NEAREST_VISIBLE_GATE, Sight, is_race_gate
+from dreamer_racing.evaluation.sight import BIN_DEGREES, NEAREST_VISIBLE_GATE, Sight, SightResults, is_race_gate
 from dreamer_racing.figures.drawing import (
     DASHED,
     INK,
     MUTED,
+    draw_altitude,
     draw_flight,
     draw_speed_scale,
     draw_track,
@@ -28,7 +28,6 @@ from dreamer_racing.figures.drawing import (
     save,
     speed_scale,
 )
-from dreamer_racing.figures.profiles import draw_altitude
 from dreamer_racing.training.directory import RunDirectory
 
 MODE_COLORS = {"deterministic": "#6f9be0", "stochastic": "#f2b705"}
@@ -37,8 +36,6 @@ CAUSE_COLORS = dict(
 )
 Z95 = 1.96  # half-width of the central 95 % of a normal distribution, in standard deviations
 SIGHT_COLORS = ("#6f9be0", "#7bc043", "#c2255c")
-Flights = Mapping[str, tuple[Track, Trajectory, Mapping[str, Sight]]]
-"""Track, one flight, and the sights over all flights, by name, such as ``without decoys``."""
 
 
 class Bar(NamedTuple):
@@ -97,7 +94,7 @@ def plot_conditions(results: Sequence[Result], path: str | Path, title: str) -> 
         _draw_bars(gates, at, passed, MODE_COLORS[mode], mode, "{:.2f}")
     _dress(success, "Success")
     _dress(gates, "Gates per episode")
-    _share_axis(success)
+    share_axis(success)
     from_zero(gates)
     gates.set_ylim(top=1.25 * gates.get_ylim()[1])
     labels = [f"{condition.replace('_', ' ')}\n{preset}" for preset, condition in places]
@@ -140,32 +137,35 @@ def plot_crashes(flown: Mapping[str, Evaluation], path: str | Path, title: str) 
     _save(figure, path, title)
 
 
-def plot_sight(flights: Flights, camera: Camera, path: str | Path, title: str) -> None:
-    """Draw where the camera pointed, on tracks of one size: flights from above, angles, and shares of time in view."""
-    columns, track = len(flights), next(iter(flights.values()))[0]
+def plot_sight(looked: Mapping[str, SightResults], camera: Camera, path: str | Path, title: str) -> None:
+    """Draw where the camera pointed, on tracks of one size: flights from above, angles, and shares of time in view.
+
+    Results are given by their names, such as ``without decoys``.
+    """
+    columns, track = len(looked), next(iter(looked.values())).track
     width, depth = (high - low for low, high in zip(track.bounds_low[:2], track.bounds_high[:2], strict=True))
     map_height = min(6.5, 8.5 / columns * depth / width)
     rows = [map_height, 1.3, 2.4, 1.9]  # inches
     figure = Figure(figsize=(10.0, sum(rows) + 2.6), layout="constrained")
     grid = figure.add_gridspec(4, columns, height_ratios=rows)
     maps, profiles, below = ([figure.add_subplot(grid[row, column]) for column in range(columns)] for row in range(3))
-    speed = speed_scale([trajectory for _, trajectory, _ in flights.values()])
-    for axes, profile, (name, (track, trajectory, _)) in zip(maps, profiles, flights.items(), strict=True):
-        draw_track(axes, track)
-        draw_flight(axes, trajectory, speed)
+    speed = speed_scale([results.trajectory for results in looked.values()])
+    for axes, profile, (name, results) in zip(maps, profiles, looked.items(), strict=True):
+        draw_track(axes, results.track)
+        draw_flight(axes, results.trajectory, speed)
         axes.set_title(name, loc="left", fontsize=10, color=INK)
-        draw_altitude(profile, track, trajectory, speed)
+        draw_altitude(profile, results.track, results.trajectory, speed)
     for axes in (*maps[1:], *profiles[1:]):
         axes.set_ylabel("")
     draw_speed_scale(figure, [*maps, *profiles], speed, "speed (m/s); arrows: camera")
-    for axes, (name, (_, _, sights)) in zip(below, flights.items(), strict=True):
-        _draw_distributions(axes, name, sights, camera)
+    for axes, (name, results) in zip(below, looked.items(), strict=True):
+        _draw_distributions(axes, name, results.sights, camera)
         axes.sharey(below[0])
     from_zero(below[0], least=0.01)
     below[0].set_ylabel("share of observations, per 5°")
     shares = {
-        name: {thing: sight for thing, sight in sights.items() if not is_race_gate(thing)}
-        for name, (_, _, sights) in flights.items()
+        name: {thing: sight for thing, sight in results.sights.items() if not is_race_gate(thing)}
+        for name, results in looked.items()
     }
     _draw_shares(figure.add_subplot(grid[3, :]), shares)
     _save(figure, path, title)
@@ -198,11 +198,11 @@ def _draw_shares(axes: Axes, flights: Mapping[str, Mapping[str, Sight]]) -> None
     axes.set_xticks(range(len(things)), labels, fontsize=8)
     axes.set_xlim(-0.6, len(things) - 0.4)
     _dress(axes, "Share of time in view; lines: 95 % interval over n flights")
-    _share_axis(axes)
+    share_axis(axes)
     axes.legend(frameon=False, fontsize=8, ncols=2, loc="upper right", bbox_to_anchor=(1.0, 1.22))
 
 
-def _share_axis(axes: Axes) -> None:
+def share_axis(axes: Axes) -> None:
     """Set the axis to shares from 0 to 1, with room above for the bars' labels."""
     axes.set_ylim(0.0, 1.35)
     axes.set_yticks([0.0, 0.25, 0.5, 0.75, 1.0])

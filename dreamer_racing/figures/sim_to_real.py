@@ -9,10 +9,9 @@ from typing import Any
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from matplotlib.ticker import PercentFormatter
 
 from dreamer_racing.figures.drawing import INK, MUTED, dress, from_zero, save
-from dreamer_racing.figures.protocol import Bar, mean_bar, share_bar
+from dreamer_racing.figures.protocol import Bar, mean_bar, share_axis, share_bar
 
 LABELS = {
     "delay": ("command delay (ms)", 1e3),
@@ -88,9 +87,8 @@ def _dress_rows(panels: np.ndarray) -> None:
     for axes in panels.flat:
         dress(axes)
     success.set_ylabel("flights that finished")
+    share_axis(success)
     success.set_ylim(-0.04, 1.16)
-    success.set_yticks([0.0, 0.25, 0.5, 0.75, 1.0])
-    success.yaxis.set_major_formatter(PercentFormatter(1.0))
     laps.set_ylabel("lap (s)")
     laps_flown = [line.get_ydata() for axes in panels[1] for line in axes.lines]
     if not any(np.isfinite(np.asarray(heights, float)).any() for heights in laps_flown):

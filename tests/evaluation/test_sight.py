@@ -9,6 +9,7 @@ import pytest
 import torch
 from PIL import Image
 from tensordict import TensorDict
+from tensordict.nn import TensorDictModule
 
 from dreamer_racing.envs.drone.rotation import from_roll_pitch_yaw
 from dreamer_racing.envs.simulator.rendering import is_in_view, points_in_camera
@@ -17,11 +18,12 @@ from dreamer_racing.envs.tracks import Gate, load_track, make_track
 from dreamer_racing.envs.worlds import RaceWorlds
 from dreamer_racing.evaluation.dreams import BelievedView, find_painter
 from dreamer_racing.evaluation.image_corruptions import CORRUPTIONS, CorruptedPolicy, Frozen, Noise, blank, intact
-from dreamer_racing.evaluation.sight import Sight, angles, gate_table, measure_sight, sight_table
+from dreamer_racing.evaluation.sight import Sight, SightResults, angles, gate_table, measure_sight, sight_table
 from dreamer_racing.evaluation.trajectory import Trajectory
 from dreamer_racing.figures.protocol import plot_sight
 from dreamer_racing.modules import Interface
 from tests.dreamers import learner_of
+from tests.figures.test_flights import level_flight
 
 LEVEL = Camera(tilt=0.0, position=(0.0, 0.0, 0.0))
 
@@ -29,16 +31,8 @@ LEVEL = Camera(tilt=0.0, position=(0.0, 0.0, 0.0))
 def flight(position, yaw_degrees=0.0, target=0, rows=1) -> Trajectory:
     """Standing still, for some rows."""
     angle = torch.zeros(rows)
-    return Trajectory(
-        position=torch.tensor(position).expand(rows, 3).clone(),
-        attitude=from_roll_pitch_yaw(angle, angle, angle + math.radians(yaw_degrees)),
-        linear_velocity=torch.zeros(rows, 3),
-        target_gate=torch.full((rows,), target),
-        action=torch.zeros(rows - 1, 4),
-        pixels=None,
-        control_dt=0.02,
-        outcome=None,
-    )
+    attitude = from_roll_pitch_yaw(angle, angle, angle + math.radians(yaw_degrees))
+    return level_flight(torch.tensor(position).repeat(rows, 1), attitude=attitude, target_gate=angle.long() + target)
 
 
 def track_of(*places):
@@ -91,14 +85,15 @@ def test_each_gate_is_seen_for_itself():
     assert [row.split(" | ")[1] for row in table[2:]] == ["next gate", "nearest visible gate"]
 
 
-def test_shares_over_flights_of_unequal_length_and_no_gate_in_view():
-    """Three rows towards the gate, one away from it: time counts, not flights."""
-    track = track_of((10.0, 0, 1.0), (20.0, 0, 1.0))
-    flights = [flight((0.0, 0.0, 1.0), rows=3), flight((0.0, 0.0, 1.0), yaw_degrees=180.0)]
-    sights = measure_sight(flights, track, LEVEL)
-    assert sights["next gate"].share_in_view == sights["nearest visible gate"].share_in_view == 0.75
-    assert sights["next gate"].angle.tolist() == pytest.approx([0, 0, 0, 180])
-    nearest = sights["nearest visible gate"]
+def test_shares_over_flights_of_unequal_length_a_lost_state_and_no_gate_in_view():
+    """Three rows towards the gate, one away from it: time counts, not flights, and not the state that was lost."""
+    towards, away = flight((0.0, 0.0, 1.0), rows=4), flight((0.0, 0.0, 1.0), yaw_degrees=180.0)
+    towards.position[0] = math.nan
+    sights = measure_sight([towards, away], track_of((10.0, 0, 1.0), (20.0, 0, 1.0)), LEVEL)
+    following, nearest = sights["next gate"], sights["nearest visible gate"]
+    assert following.share_in_view == nearest.share_in_view == 0.75
+    assert following.angle.tolist() == pytest.approx([0, 0, 0, 180])
+    assert following.flight.tolist() == [0, 0, 0, 1] and following.shares_by_flight == [1.0, 0.0]
     assert nearest.angle.isnan().tolist() == [False, False, False, True]
     assert nearest.to_dict()["angle_mean_degrees"] == 0.0
 
@@ -107,17 +102,9 @@ def test_decoys_count_whether_they_stand_there_or_not():
     decoys = [Gate((0.0, 5.0, 1.0), 0.0, kind="decoy"), Gate((5.0, 5.0, 1.0), 0.0, kind="decoy")]
     track = track_of((10.0, 0, 1.0), (20.0, 0, 1.0))
     sights = measure_sight([flight((0.0, 0.0, 1.0), yaw_degrees=30.0)], track, LEVEL, decoys)
-    assert [sights[name].angle.item() for name in ("decoy 1", "decoy 2", "any decoy")] == pytest.approx([60, 15, 15])
-    assert [sights[name].in_view.item() for name in ("decoy 1", "decoy 2", "any decoy")] == [False, True, True]
-
-
-def test_observations_know_their_flight_and_a_lost_state_is_left_out():
-    track = track_of((10.0, 0, 1.0), (20.0, 0, 1.0))
-    lost = flight((0.0, 0.0, 1.0), rows=2)
-    lost.position[0] = math.nan
-    away = flight((0.0, 0.0, 1.0), yaw_degrees=180.0, rows=3)
-    sight = measure_sight([lost, away], track, LEVEL)["next gate"]
-    assert len(sight.angle) == 4 and sight.flight.tolist() == [0, 1, 1, 1] and sight.shares_by_flight == [1.0, 0.0]
+    seen = [sights[name] for name in ("decoy 1", "decoy 2", "any decoy")]
+    assert [sight.angle.item() for sight in seen] == pytest.approx([60, 15, 15])
+    assert [sight.in_view.item() for sight in seen] == [False, True, True]
 
 
 def test_numbers_of_a_sight():
@@ -143,9 +130,9 @@ def test_plot_of_flights_with_and_without_decoys(tmp_path):
     track, other = load_track("figure8"), load_track("figure8_decoys")
     still = flight(track.start_position, rows=10)
     sights = measure_sight([still], track, Camera(), other.decoys)
-    flights = {"without": (track, still, sights), "with": (other, still, sights)}
-    plot_sight(flights, Camera(), tmp_path / "new" / "both.png", "a title")
-    plot_sight({"without": flights["without"]}, Camera(), tmp_path / "one.png", "a title")
+    without, decoyed = (SightResults(one, 0.0, 0.0, still, sights) for one in (track, other))
+    plot_sight({"without": without, "with": decoyed}, Camera(), tmp_path / "new" / "both.png", "a title")
+    plot_sight({"without": without}, Camera(), tmp_path / "one.png", "a title")
     with Image.open(tmp_path / "new" / "both.png") as both, Image.open(tmp_path / "one.png") as one:
         assert both.width == one.width == 1500
 
@@ -178,19 +165,6 @@ def images(*values: int) -> torch.Tensor:
     return torch.tensor(values, dtype=torch.uint8).view(-1, 1, 1, 1).expand(-1, 2, 2, 3).clone()
 
 
-class Watching:
-    """Remembers what it saw."""
-
-    deterministic = False
-
-    def __init__(self) -> None:
-        self.seen: list[torch.Tensor] = []
-
-    def __call__(self, tensordict):
-        self.seen.append(tensordict["pixels"].clone())
-        return tensordict.set("action", torch.zeros(*tensordict.batch_size, 4))
-
-
 def test_frozen_shows_the_first_image_of_each_episode():
     frozen, first = Frozen(), images(1, 2)
     shown = [frozen(first, torch.tensor([True, True]))]
@@ -212,17 +186,15 @@ def test_noise_is_uniform_new_at_every_step_and_seeded():
 
 
 def test_only_the_policy_sees_corrupted_images():
-    watching = Watching()
+    watching = TensorDictModule(lambda pixels: pixels.clone(), ["pixels"], ["action"])  # acts by what it sees
     data = TensorDict({"pixels": images(1, 2), "is_init": torch.ones(2, 1, dtype=torch.bool)}, [2])
     policy = CorruptedPolicy(watching, blank)
     acted = policy(data)
-    assert watching.seen[0].unique().tolist() == [128]
+    assert acted["action"].unique().tolist() == [128]
     assert acted["pixels"][:, 0, 0, 0].tolist() == data["pixels"][:, 0, 0, 0].tolist() == [1, 2]
-    assert acted["action"].shape == (2, 4)
     policy.deterministic = True
     assert watching.deterministic and policy.deterministic
-    CorruptedPolicy(watching, intact)(data)
-    assert torch.equal(watching.seen[1], data["pixels"])
+    assert torch.equal(CorruptedPolicy(watching, intact)(data)["action"], data["pixels"])
     with pytest.raises(ValueError, match="no 'pixels'"):
         policy(data.exclude("pixels"))
 
@@ -230,21 +202,15 @@ def test_only_the_policy_sees_corrupted_images():
 # What shows a world model's latents; how dreams are stored is tested in tests/figures/test_flights.py.
 
 
-def flown(worlds: RaceWorlds, steps: int) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
-    """Race vectors (N, T, 21), images (N, T, H, W, 3) and target gates (N, T) of a flight."""
-    worlds.reset()
-    seen = []
-    for _ in range(steps):
-        worlds.step(torch.zeros(worlds.num_envs, 4))
-        seen.append((worlds.vector(), worlds.render(), worlds.race.target_gate.clone()))
-    vector, images, gate = (torch.stack(parts, 1) for parts in zip(*seen, strict=True))
-    return vector, images, gate
-
-
 def test_the_view_of_the_true_state_equals_the_camera_image() -> None:
     """Latents that are the race vector, over more frames than there are worlds; the drones stay where they are."""
     worlds = RaceWorlds("kidney", num_envs=3, start_on_line=1.0)
-    vector, images, gate = flown(worlds, 4)
+    worlds.reset()
+    seen = []
+    for _ in range(4):
+        worlds.step(torch.zeros(3, 4))
+        seen.append((worlds.vector(), worlds.render(), worlds.race.target_gate.clone()))
+    vector, images, gate = (torch.stack(parts, 1) for parts in zip(*seen, strict=True))  # each (3, 4, ...)
     before = worlds.simulator.state.position.clone()
     painter = BelievedView(torch.nn.Identity(), worlds)
     views = painter(vector[..., :9], vector[..., 9:], gate)
@@ -276,8 +242,7 @@ def test_latents_are_shown_by_what_decodes_them() -> None:
         painter = find_painter(learner, worlds)
         assert (painter is not None) == shown, world_model
         if painter is not None:
-            size = learner.size
-            belief, state = torch.zeros(1, 3, size.belief), torch.zeros(1, 3, size.state)
-            images = painter(belief, state, torch.zeros(1, 3, dtype=torch.int64))
+            latents = [torch.zeros(1, 3, size) for size in (learner.size.belief, learner.size.state)]
+            images = painter(*latents, torch.zeros(1, 3, dtype=torch.int64))
             assert images.shape == (1, 3, 64, 64, 3) and images.dtype == torch.uint8
     worlds.close()

@@ -20,10 +20,18 @@ from dreamer_racing.evaluation.trajectory import (
     write_flight,
     write_trajectory,
 )
-from dreamer_racing.figures.drawing import CRASH_COLOR, GATE_COLOR, speed_scale
+from dreamer_racing.figures.drawing import (
+    CRASH_COLOR,
+    GATE_COLOR,
+    MISSED_COLOR,
+    Crossing,
+    crossings,
+    draw_altitude,
+    profile_axis,
+    speed_scale,
+)
 from dreamer_racing.figures.film import CONTEXT_COLOR, OPEN_LOOP_COLOR, dream_video, film_strip, shown_frames
 from dreamer_racing.figures.flights import NamedFlight, plot_dreams, plot_flights
-from dreamer_racing.figures.profiles import MISSED_COLOR, Crossing, crossings, draw_altitude, profile_axis
 
 
 def random_flight(steps: int = 60, outcome: str | None = "ground", pixels: bool = False) -> Trajectory:
@@ -41,27 +49,36 @@ def random_flight(steps: int = 60, outcome: str | None = "ground", pixels: bool 
     )
 
 
+def level_flight(position: torch.Tensor, **fields: object) -> Trajectory:
+    """Through positions (K + 1, 3), level and at rest unless fields say otherwise."""
+    rows = len(position)
+    still = {
+        "attitude": torch.tensor([1.0, 0.0, 0.0, 0.0]).repeat(rows, 1),
+        "linear_velocity": torch.zeros(rows, 3),
+        "target_gate": torch.zeros(rows, dtype=torch.int64),
+        "action": torch.zeros(rows - 1, 4),
+    }
+    return Trajectory(position, **{**still, "pixels": None, "control_dt": 0.02, "outcome": None, **fields})
+
+
 # --- stored flights ---
 
 
-@pytest.mark.parametrize("outcome", ["ground", "finished", None])
-def test_a_flight_comes_back_exactly(tmp_path, outcome):
+EDITED = replace(load_track("circle"), name="kidney", laps=2)  # called as another, as an edited copy may be
+
+
+@pytest.mark.parametrize(("outcome", "course"), [("ground", "figure8_decoys"), ("finished", EDITED), (None, "split_s")])
+def test_a_flight_comes_back_exactly(tmp_path, outcome, course):
     before = random_flight(outcome=outcome)
     before.position[-1] = math.nan
     before.linear_velocity[-1, 0] = math.inf
-    write_trajectory(tmp_path / "new" / "flight.csv", before, "figure8_decoys")
+    write_trajectory(tmp_path / "new" / "flight.csv", before, course)
     after, track = read_trajectory(tmp_path / "new" / "flight.csv")
-    assert track == load_track("figure8_decoys")
+    assert track == load_track(course)
     assert (after.control_dt, after.outcome, after.pixels) == (0.02, outcome, None)
     for name in ("position", "attitude", "linear_velocity", "target_gate", "action"):
         torch.testing.assert_close(getattr(after, name), getattr(before, name), rtol=0, atol=0, equal_nan=True)
     assert [path.name for path in (tmp_path / "new").iterdir()] == ["flight.csv"]
-
-
-def test_a_track_that_was_changed_since_is_drawn_as_it_was_flown(tmp_path):
-    mine = replace(load_track("circle"), name="kidney", laps=2)  # called as another, as an edited copy may be
-    write_trajectory(tmp_path / "flight.csv", random_flight(), mine)
-    assert read_trajectory(tmp_path / "flight.csv")[1] == mine
 
 
 def test_value_and_images_come_back_with_the_flight(tmp_path):
@@ -228,12 +245,9 @@ def test_maps_of_different_halls_have_one_scale_and_stand_in_line(tmp_path, figu
 
 def straight(height: float, backwards: bool = False) -> Trajectory:
     """Along x from −2 to 2 m in 4 steps at one height; the first gate counts between 0 and 1 m if it does."""
-    steps = torch.arange(-2.0, 3.0)
-    x = -steps if backwards else steps
-    flight = random_flight(steps=4, outcome=None)
-    flight.position[:] = torch.stack((x, torch.zeros(5), torch.full((5,), height)), dim=-1)
-    flight.target_gate[:] = torch.tensor([0, 0, 0, 1, 1]) if height == 1.35 and not backwards else 0
-    return flight
+    x, passes = torch.arange(-2.0, 3.0), height == 1.35 and not backwards
+    position = torch.stack((-x if backwards else x, 0 * x, 0 * x + height), dim=-1)
+    return level_flight(position, target_gate=torch.tensor([0, 0, 0, passes, passes]).long())
 
 
 def test_altitude_tells_a_gate_passed_from_one_flown_over(figures):
@@ -253,8 +267,7 @@ def test_altitude_tells_a_gate_passed_from_one_flown_over(figures):
 
 
 def test_axis_of_the_profiles():
-    flight = random_flight(steps=2)
-    flight.position[:] = torch.tensor([[0.0, 0, 0], [3, 4, 0], [3, 4, 12]])
+    flight = level_flight(torch.tensor([[0.0, 0, 0], [3, 4, 0], [3, 4, 12]]))
     np.testing.assert_allclose(profile_axis(flight, "distance"), [0, 5, 17])
     np.testing.assert_allclose(profile_axis(flight, "time"), [0, 0.02, 0.04])
 
