@@ -21,13 +21,14 @@ from composing.entry import plain_errors, recipe
 from composing.restoring import FlightConfig, restore
 
 from dreamer_racing.commands import from_here
-from dreamer_racing.envs.tracks import Track, load_track
+from dreamer_racing.envs.tracks import load_track
 from dreamer_racing.evaluation.protocol import fly as fly_races
 from dreamer_racing.evaluation.trajectory import NUMBERS, read_flight
 from dreamer_racing.export.agents import existing_agent_path
 from dreamer_racing.export.shipped_agent import is_agent
 from dreamer_racing.figures.dashboard import serve, write_page
-from dreamer_racing.figures.dashboard_panel import ShownFlight, how_it_trained, missing
+from dreamer_racing.figures.dashboard_panel import how_it_trained, missing
+from dreamer_racing.figures.flights import NamedFlight
 from dreamer_racing.figures.plotting import STORED, run_of, stage_name, stored_flights
 from dreamer_racing.figures.scene_3d import check_viser
 from dreamer_racing.settings import SEED, Range, setting
@@ -59,8 +60,7 @@ class DashboardConfig:
 class Source(NamedTuple):
     """A flight, and where it came from."""
 
-    flight: ShownFlight
-    track: Track
+    flight: NamedFlight
     folder: Path  # of the run, or else of the stored flight
 
 
@@ -71,15 +71,15 @@ def main(config: DashboardConfig) -> None:
         check_viser()
         sources = find(config)
         training = [how_it_trained(source.folder for source in sources)]
-        flights, track = [source.flight for source in sources], sources[0].track
+        flights = [source.flight for source in sources]
         output = Path(config.output or Path(from_here(sources[0].folder)) / PAGE)
-        size = write_page(output, track, flights, training)
+        size = write_page(output, flights, training)
     for line in (*training, *(line for flight in flights for line in missing(flight))):
         print(line.replace("`", ""))
     print(f"page: {output} ({size / 1e6:.1f} MB, opens in a browser without a server)")
     if config.serve is not None:
         try:
-            serve(track, flights, config.serve, training, lambda live: print(f"live: {live} until Ctrl+C", flush=True))
+            serve(flights, config.serve, training, lambda live: print(f"live: {live} until Ctrl+C", flush=True))
         except KeyboardInterrupt:
             print("ended")
 
@@ -89,12 +89,12 @@ def find(config: DashboardConfig) -> list[Source]:
     places = [locate("run", config.run) if config.run is not None else str(config.agent)]
     places += [] if config.against is None else [locate("against", config.against)]
     sources = [read(place) if isinstance(place, Path) else fly(place, config) for place in places]
-    first, *others = sources
+    first, *others = (source.flight for source in sources)
     for other in others:
         if other.track != first.track:
             again = " with other gates" if other.track.name == first.track.name else ""
             raise ValueError(
-                f"against={config.against} was flown on {other.track.name}{again}, {first.flight.title} on "
+                f"against={config.against} was flown on {other.track.name}{again}, {first.title} on "
                 f"{first.track.name}: only flights on one track can be shown in one scene."
             )
     return sources
@@ -121,7 +121,7 @@ def read(file: Path) -> Source:
     trajectory, track = read_flight(file)
     folder = run_of(file)
     stage = "" if file.name == f"{STORED[0]}{NUMBERS}" else f", {stage_name(file)}"
-    return Source(ShownFlight(f"{folder.name}{stage}", trajectory), track, folder)
+    return Source(NamedFlight(f"{folder.name}{stage}", track, trajectory), folder)
 
 
 def fly(place: str, config: DashboardConfig) -> Source:
@@ -132,8 +132,8 @@ def fly(place: str, config: DashboardConfig) -> Source:
     flown = fly_races(policy, worlds, episodes=1, value_function=value_function)
     print(flown.summary())
     name = restored.checkpoint.name if is_agent(restored.checkpoint) else restored.run_dir.name
-    flight = ShownFlight(f"{name}, {restored.env_steps:,} env_steps", flown.trajectories[0])
-    return Source(flight, load_track(worlds["track"]), restored.run_dir)
+    title, track = f"{name}, {restored.env_steps:,} env_steps", load_track(worlds["track"])
+    return Source(NamedFlight(title, track, flown.trajectories[0]), restored.run_dir)
 
 
 if __name__ == "__main__":

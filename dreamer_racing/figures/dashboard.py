@@ -16,13 +16,11 @@ from itertools import pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from dreamer_racing.envs.tracks import Track
 from dreamer_racing.evaluation.trajectory import Trajectory
 from dreamer_racing.figures.dashboard_panel import (
     SHEET_COLUMNS,
     STYLE,
     TRACES,
-    ShownFlight,
     beside,
     duration,
     panel,
@@ -30,6 +28,7 @@ from dreamer_racing.figures.dashboard_panel import (
     row_at,
     state_words,
 )
+from dreamer_racing.figures.flights import NamedFlight
 from dreamer_racing.figures.scene_3d import RaceScene, check_viser, paints
 from dreamer_racing.training.directory import replace_text
 
@@ -49,8 +48,8 @@ IN_VISER = """
 """CSS differences from the page in a file: viser places the panel, and numbers are shown below viser's slider."""
 
 
-def write_page(path: str | Path, track: Track, flights: Sequence[ShownFlight], training: Sequence[str] = ()) -> int:
-    """Write the page of one or two flights on a track; return its size in bytes.
+def write_page(path: str | Path, flights: Sequence[NamedFlight], training: Sequence[str] = ()) -> int:
+    """Write the page of one flight, or of two on the same track; return its size in bytes.
 
     Lines of ``training`` say how to see the flights' training curves, with commands between backquotes.
 
@@ -58,18 +57,18 @@ def write_page(path: str | Path, track: Track, flights: Sequence[ShownFlight], t
         ValueError: viser is not installed.
     """
     check_viser()
-    text = compose(record(track, flights), track, flights, training)
+    text = compose(record(flights), flights, training)
     Path(path).parent.mkdir(parents=True, exist_ok=True)
     replace_text(Path(path), text)
     return len(text.encode())
 
 
-def record(track: Track, flights: Sequence[ShownFlight]) -> str:
+def record(flights: Sequence[NamedFlight]) -> str:
     """Return viser's HTML page that plays the flights from their start."""
     trajectories = [flight.trajectory for flight in flights]
     times = moments(trajectories)
     with quiet_server(port=0) as server:
-        scene = RaceScene(server, track, trajectories)
+        scene = RaceScene(server, flights[0].track, trajectories)
         scene.place([0] * len(flights))
         recording = server.get_scene_serializer()
         for now, following in pairwise([*times, times[-1] + HOLD]):
@@ -92,18 +91,18 @@ def quiet_server(port: int) -> Iterator[viser.ViserServer]:
             server.stop()
 
 
-def compose(viewer: str, track: Track, flights: Sequence[ShownFlight], training: Sequence[str]) -> str:
+def compose(viewer: str, flights: Sequence[NamedFlight], training: Sequence[str]) -> str:
     """Insert the panel into viser's page; raise RuntimeError if its HTML is not that of the expected version."""
     names = " against ".join(flight.title for flight in flights)
     title, end = "<title>Viser</title>", "</body>"
     if viewer.count(title) != 1 or end not in viewer:
         raise RuntimeError(f"viser's page has no {title} or no {end}: this version of viser is not the one expected.")
-    viewer = viewer.replace(title, f"<title>{escape(track.name)}: {escape(names)}</title>")
+    viewer = viewer.replace(title, f"<title>{escape(flights[0].track.name)}: {escape(names)}</title>")
     body, _, rest = viewer.rpartition(end)
-    data = json.dumps(readings(track, flights), allow_nan=False).replace("<", "\\u003c")
+    data = json.dumps(readings(flights), allow_nan=False).replace("<", "\\u003c")
     parts = (
         f"<style>{beside(STYLE)}{beside('dashboard_page.css')}</style>",
-        panel(track, flights, [*training, KEYS]),
+        panel(flights, [*training, KEYS]),
         f'<script type="application/json" id="flights">{data}</script>',
         f"<script>{beside('dashboard.js')}</script>",
     )
@@ -117,14 +116,13 @@ def moments(flights: Sequence[Trajectory]) -> list[float]:
 
 
 def serve(
-    track: Track,
-    flights: Sequence[ShownFlight],
+    flights: Sequence[NamedFlight],
     port: int,
     training: Sequence[str] = (),
     announce: Callable[[str], None] = lambda address: None,
     goes_on: Callable[[], bool] = lambda: True,
 ) -> None:
-    """Serve a live page of one or two flights to browsers on this machine, until ``goes_on`` returns False.
+    """Serve a live page of one or two flights on a track to browsers on this machine, until ``goes_on`` returns False.
 
     The port is the next free one if it is taken; ``announce`` is called with the address once the page is ready.
 
@@ -135,20 +133,20 @@ def serve(
     trajectories = [flight.trajectory for flight in flights]
     end = duration(trajectories)
     with quiet_server(port) as server:
-        scene = RaceScene(server, track, trajectories)
+        scene = RaceScene(server, flights[0].track, trajectories)
         # A share button would open a tunnel to this machine from outside.
         server.gui.configure_theme(control_width="large", show_share_button=False, show_logo=False)
         server.gui.main_panel.dock_right()
         play = server.gui.add_checkbox("play", True)
         now: Any = server.gui.add_slider("time (s)", 0.0, end, min(0.01, end), 0.0)
         numbers, moving = server.gui.add_html(""), server.gui.add_html("")
-        server.gui.add_html(f"<style>{beside(STYLE)}{IN_VISER}</style>{panel(track, flights, training)}")
+        server.gui.add_html(f"<style>{beside(STYLE)}{IN_VISER}</style>{panel(flights, training)}")
         announce(f"http://{LOOPBACK}:{server.get_port()}")
         while goes_on():
             began = time.monotonic()
             rows = [row_at(trajectory, now.value) for trajectory in trajectories]
             scene.place(rows)
-            numbers.content = number_table(track, flights, rows)
+            numbers.content = number_table(flights, rows)
             moving.content = f"<style>{positions(rows, now.value / end)}</style>"
             time.sleep(FRAME)
             if play.value:
@@ -165,13 +163,13 @@ def positions(rows: Sequence[int], share: float) -> str:
     return "".join((f".dashboard {{ --now: {share:.4f} !important }}", *views))
 
 
-def number_table(track: Track, flights: Sequence[ShownFlight], rows: Sequence[int]) -> str:
+def number_table(flights: Sequence[NamedFlight], rows: Sequence[int]) -> str:
     """Return an HTML table with lap, gate and all traces of each flight at its row."""
     columns = []
-    for (_, trajectory), paint, row in zip(flights, paints(len(flights)), rows, strict=True):
-        cells = list(state_words(track, trajectory)[row])
+    for flight, paint, row in zip(flights, paints(len(flights)), rows, strict=True):
+        cells = list(state_words(flight)[row])
         for trace in TRACES:
-            values = trace.values(trajectory)
+            values = trace.values(flight.trajectory)
             cells.append("–" if values is None or row >= len(values) else f"{values[row]:.2f} {trace.unit}")
         columns.append([f'<td style="color: {paint.color}">{cell}</td>' for cell in cells])
     names = ("lap", "gate", "", *(trace.name for trace in TRACES))

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 from html import escape
 from itertools import pairwise
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from matplotlib.colors import to_hex
@@ -22,10 +22,10 @@ from PIL import Image
 
 from dreamer_racing.commands import from_here
 from dreamer_racing.envs.drone.parameters import QuadrotorParameters
-from dreamer_racing.envs.tracks import Track
 from dreamer_racing.evaluation.trajectory import Trajectory
 from dreamer_racing.figures.drawing import speed_scale
 from dreamer_racing.figures.film import laps_completed
+from dreamer_racing.figures.flights import NamedFlight
 from dreamer_racing.figures.scene_3d import DRONE_SCALE, Paint, paints
 
 SHEET_COLUMNS = 25  # images per row of the sheet with all images of a flight
@@ -33,13 +33,6 @@ CURVE_WIDTH, CURVE_HEIGHT = 1000.0, 100.0  # in a curve's SVG coordinates
 HEADROOM = 0.06  # space above and below a curve, as a share of its range
 COLOR_STOPS = 8  # number of colours in a legend's gradient
 STYLE = "dashboard.css"  # in this module's folder
-
-
-class ShownFlight(NamedTuple):
-    """A recorded episode from its start, and its title."""
-
-    title: str
-    trajectory: Trajectory
 
 
 @dataclass(frozen=True)
@@ -71,22 +64,22 @@ TRACES = (
 """The curves of a page: speed, the actor's four commands, and the critic's value."""
 
 
-def panel(track: Track, flights: Sequence[ShownFlight], training: Sequence[str]) -> str:
+def panel(flights: Sequence[NamedFlight], training: Sequence[str]) -> str:
     """Return the HTML of the panel: legend, images, state, curves, notes."""
     colors = paints(len(flights))
     shown = list(zip(flights, colors, strict=True))
     lines = [*training, *(line for flight in flights for line in missing(flight))]
     lines.append(f"Drones are drawn {DRONE_SCALE:g} times their size.")
     parts = (
-        f"<header><h1>{escape(track.name)}</h1>{_legend(shown)}</header>",
-        f'<section class="views">{_views(shown)}{_state(track, shown)}</section>',
+        f"<header><h1>{escape(flights[0].track.name)}</h1>{_legend(shown)}</header>",
+        f'<section class="views">{_views(shown)}{_state(shown)}</section>',
         f'<section class="curves">{"".join(_curves(shown))}<i class="cursor"></i></section>',
         f"<footer>{''.join(f'<p>{_with_code_elements(line)}</p>' for line in lines)}</footer>",
     )
     return f'<aside class="dashboard">{"".join(parts)}</aside>'
 
 
-def missing(flight: ShownFlight) -> Iterator[str]:
+def missing(flight: NamedFlight) -> Iterator[str]:
     """Yield a sentence with the reason for everything that a flight's page cannot show."""
     if flight.trajectory.pixels is None:
         yield f"{flight.title}: no images, because none were recorded with the flight."
@@ -106,7 +99,7 @@ def how_it_trained(folders: Iterable[Path]) -> str:
     return f"Training curves: `tensorboard --logdir_spec {shlex.quote(runs)}`"
 
 
-def readings(track: Track, flights: Sequence[ShownFlight]) -> dict[str, Any]:
+def readings(flights: Sequence[NamedFlight]) -> dict[str, Any]:
     """Return the panel's words and numbers at each row of each flight, as JSON values."""
     return {
         "duration": duration([flight.trajectory for flight in flights]),
@@ -114,7 +107,7 @@ def readings(track: Track, flights: Sequence[ShownFlight]) -> dict[str, Any]:
         "flights": [
             {
                 "control_dt": flight.trajectory.control_dt,
-                "words": state_words(track, flight.trajectory),
+                "words": state_words(flight),
                 "values": {
                     trace.name: [round(value, 3) if math.isfinite(value) else None for value in values.tolist()]
                     for trace in TRACES
@@ -126,12 +119,13 @@ def readings(track: Track, flights: Sequence[ShownFlight]) -> dict[str, Any]:
     }
 
 
-def state_words(track: Track, flight: Trajectory) -> list[list[str]]:
-    """Return lap, next gate and status at each of the K + 1 rows of a flight."""
-    laps = np.minimum(laps_completed(flight) + 1, track.laps).tolist()
-    rows = zip(laps, (flight.target_gate + 1).tolist(), strict=True)
+def state_words(flight: NamedFlight) -> list[list[str]]:
+    """Return lap, next gate and status at each of the K + 1 rows of a flight from its start."""
+    _, track, trajectory = flight
+    laps = np.minimum(laps_completed(trajectory) + 1, track.laps).tolist()
+    rows = zip(laps, (trajectory.target_gate + 1).tolist(), strict=True)
     words = [[f"{lap}/{track.laps}", f"{gate}/{track.num_gates}", "flying"] for lap, gate in rows]
-    words[-1][2] = flight.ending
+    words[-1][2] = trajectory.ending
     return words
 
 
@@ -147,7 +141,7 @@ def image_sheet(pixels: np.ndarray) -> str:
     return f"data:image/png;base64,{base64.b64encode(buffer.getvalue()).decode()}"
 
 
-def _legend(shown: Sequence[tuple[ShownFlight, Paint]]) -> str:
+def _legend(shown: Sequence[tuple[NamedFlight, Paint]]) -> str:
     """Return each flight's colour, result, and colour scale of speeds."""
     top = speed_scale([flight.trajectory for flight, _ in shown]).vmax
     rows = []
@@ -169,7 +163,7 @@ def _result(flight: Trajectory) -> str:
     return f"{flight.ending}, {'laps ' + laps + ' s' if laps else 'no lap'}"
 
 
-def _views(shown: Sequence[tuple[ShownFlight, Paint]]) -> str:
+def _views(shown: Sequence[tuple[NamedFlight, Paint]]) -> str:
     """Return the on-board images, or a note for a flight without images."""
     views = []
     for index, (flight, paint) in enumerate(shown):
@@ -186,19 +180,19 @@ def _views(shown: Sequence[tuple[ShownFlight, Paint]]) -> str:
     return "".join(views)
 
 
-def _state(track: Track, shown: Sequence[tuple[ShownFlight, Paint]]) -> str:
+def _state(shown: Sequence[tuple[NamedFlight, Paint]]) -> str:
     """Return the HTML table of time, lap, gate and status; the page updates its cells."""
     head = '<tr><td class="time" colspan="3" data-time>0.00 s</td></tr><tr><th>lap</th><th>gate</th><th></th></tr>'
     rows = [
         f'<tr style="--color: {paint.color}" title="{escape(flight.title)}">'
-        + "".join(f'<td data-words="{index}">{escape(word)}</td>' for word in state_words(track, flight.trajectory)[0])
+        + "".join(f'<td data-words="{index}">{escape(word)}</td>' for word in state_words(flight)[0])
         + "</tr>"
         for index, (flight, paint) in enumerate(shown)
     ]
     return f'<table class="state">{head}{"".join(rows)}</table>'
 
 
-def _curves(shown: Sequence[tuple[ShownFlight, Paint]]) -> Iterator[str]:
+def _curves(shown: Sequence[tuple[NamedFlight, Paint]]) -> Iterator[str]:
     """Yield the curves of each trace that at least one flight has, and their time axis."""
     longest = duration([flight.trajectory for flight, _ in shown])
     passes = "".join(_passes(flight.trajectory, paint, longest) for flight, paint in shown)

@@ -9,8 +9,8 @@ import re
 import socket
 import urllib.request
 from dataclasses import replace
-from html.parser import HTMLParser
 from pathlib import Path
+from xml.etree import ElementTree
 
 import numpy as np
 import pytest
@@ -22,7 +22,6 @@ from dreamer_racing.evaluation.trajectory import Trajectory
 from dreamer_racing.figures import dashboard, scene_3d
 from dreamer_racing.figures.dashboard_panel import (
     SHEET_COLUMNS,
-    ShownFlight,
     image_sheet,
     missing,
     panel,
@@ -30,6 +29,7 @@ from dreamer_racing.figures.dashboard_panel import (
     row_at,
     state_words,
 )
+from dreamer_racing.figures.flights import NamedFlight
 from tests.chromium import PROGRAM, open_page
 
 CIRCLE = load_track("circle")
@@ -56,26 +56,13 @@ def circling(rows: int = 61, control_dt: float = 0.05, seen: bool = True, judged
     )
 
 
-def shown(*flights: Trajectory) -> list[ShownFlight]:
-    return [ShownFlight(f"flight {index}", flight) for index, flight in enumerate(flights, start=1)]
+def shown(*flights: Trajectory) -> list[NamedFlight]:
+    return [NamedFlight(f"flight {index}", CIRCLE, flight) for index, flight in enumerate(flights, start=1)]
 
 
-class Tags(HTMLParser):
-    """Whether every tag is closed by its own."""
-
-    def __init__(self, text: str) -> None:
-        super().__init__()
-        self.open: list[str] = []
-        self.feed(text)
-
-    def handle_starttag(self, tag: str, attributes: object) -> None:
-        self.open.append(tag)
-
-    def handle_startendtag(self, tag: str, attributes: object) -> None:
-        pass
-
-    def handle_endtag(self, tag: str) -> None:
-        assert self.open.pop() == tag
+def check_tags(text: str) -> None:
+    """Refuse a tag that is not closed by its own."""
+    ElementTree.fromstring(text.replace(" data-time>", ' data-time="">'))
 
 
 # --- what it says ---
@@ -84,7 +71,7 @@ class Tags(HTMLParser):
 def test_numbers_are_those_of_the_flight_in_si_units():
     flight = circling()
     flight = replace(flight, action=torch.tensor([[-1.0, 0.5, -1.0, 2.0]]).expand(60, 4))  # yaw is clipped, as flown
-    said = readings(CIRCLE, shown(flight))["flights"][0]
+    said = readings(shown(flight))["flights"][0]
     assert {name: (values[0], len(values)) for name, values in said["values"].items()} == {
         "speed": (2.0, 61), "thrust": (0.0, 60), "roll rate": (5.0, 60), "pitch rate": (-10.0, 60),
         "yaw rate": (4.0, 60), "value": (0.0, 60),
@@ -96,8 +83,8 @@ def test_numbers_are_those_of_the_flight_in_si_units():
 def test_a_non_finite_state_is_drawn_as_a_gap():
     flight = circling()
     flight.position[-1], flight.linear_velocity[-1] = torch.nan, torch.nan
-    assert readings(CIRCLE, shown(flight))["flights"][0]["values"]["speed"][-1] is None
-    drawn = panel(CIRCLE, shown(flight), [])
+    assert readings(shown(flight))["flights"][0]["values"]["speed"][-1] is None
+    drawn = panel(shown(flight), [])
     assert "nan" not in drawn.lower()
 
 
@@ -105,33 +92,30 @@ def test_what_was_not_recorded_is_named_and_not_drawn():
     without, judged = circling(seen=False, judged=False), circling()
     assert [line.partition(": ")[2].split(",")[0] for line in missing(shown(without)[0])] == ["no images", "no value"]
     assert not list(missing(shown(judged)[0]))
-    alone = panel(CIRCLE, shown(without), [])
+    alone = panel(shown(without), [])
     assert "no images recorded" in alone and 'data-of="value"' not in alone and 'data-of="speed"' in alone
-    both = panel(CIRCLE, shown(judged, without), [])
+    both = panel(shown(judged, without), [])
     assert both.count('data-of="value"') == 1 and both.count('data-of="speed"') == 2
     assert "flight 2: no value" in both and "flight 1: no value" not in both
 
 
 def test_the_cursor_and_the_last_gate_share_one_axis():
     """A flight half as long takes half of the width."""
-    both = panel(CIRCLE, shown(circling(), circling(control_dt=0.025)), [])
+    both = panel(shown(circling(), circling(control_dt=0.025)), [])
     curves = re.findall(r'<polyline points="([^"]+)" stroke="(#\w+)"', both)
     ends = {color: float(points.split()[-1].partition(",")[0]) for points, color in curves[:2]}
     assert sorted(ends.values()) == [500.0, 1000.0]
 
 
 def test_the_panel_is_well_formed_and_takes_titles_for_text():
-    flights = [ShownFlight("</script><b>&", circling())]
-    drawn = panel(CIRCLE, flights, ["run `a <b> c`"])
-    assert not Tags(drawn).open
+    flights = [NamedFlight("</script><b>&", CIRCLE, circling())]
+    drawn = panel(flights, ["run `a <b> c`"])
+    check_tags(drawn)
     assert "</script>" not in drawn and "<code>a &lt;b&gt; c</code>" in drawn
-    page = dashboard.compose("<html><title>Viser</title><body></body></html>", CIRCLE, flights, [])
+    page = dashboard.compose("<html><title>Viser</title><body></body></html>", flights, [])
     assert page.count("</script>") == 2  # those of ours
-
-
-def test_a_viewer_that_is_built_otherwise_is_refused():
-    with pytest.raises(RuntimeError, match="not the one expected"):
-        dashboard.compose("<html><title>Another</title></body>", CIRCLE, shown(circling()), [])
+    with pytest.raises(RuntimeError, match="not the one expected"):  # a viewer that is built otherwise
+        dashboard.compose("<html><title>Another</title></body>", flights, [])
 
 
 def test_an_image_lies_where_the_panel_looks_for_it():
@@ -151,13 +135,13 @@ def test_flights_of_different_rates_keep_their_own_time():
     assert times[0] == 0.0 and times[-1] == pytest.approx(1.5)
     for row in range(61):
         assert row_at(fast, row * 0.02) == row and row_at(fast, row * 0.02 - 0.001) == max(row - 1, 0)
-    assert row_at(fast, 99.0) == 60 and state_words(CIRCLE, fast)[60][2] == "gate frame"
+    assert row_at(fast, 99.0) == 60 and state_words(shown(fast)[0])[60][2] == "gate frame"
 
 
 def test_without_viser_the_extra_is_named(monkeypatch, tmp_path):
     monkeypatch.setattr(scene_3d.importlib.util, "find_spec", lambda name: None)
     with pytest.raises(ValueError, match=r"pip install .*\[dashboard\]"):
-        dashboard.write_page(tmp_path / "page.html", CIRCLE, shown(circling()))
+        dashboard.write_page(tmp_path / "page.html", shown(circling()))
     assert not list(tmp_path.iterdir())
 
 
@@ -170,7 +154,7 @@ def page(tmp_path_factory: pytest.TempPathFactory) -> Path:
     pytest.importorskip("viser", reason="needs viser, of the extra dashboard")
     path = tmp_path_factory.mktemp("new") / "deeper" / "page.html"
     flights = shown(circling(), circling(21, 0.1, judged=False))
-    size = dashboard.write_page(path, CIRCLE, flights, ["Training curves: `tensorboard --logdir runs/a`"])
+    size = dashboard.write_page(path, flights, ["Training curves: `tensorboard --logdir runs/a`"])
     assert path.stat().st_size == size and [file.name for file in path.parent.iterdir()] == ["page.html"]
     return path
 
@@ -230,7 +214,7 @@ def test_the_live_page_is_served_to_this_machine_alone():
             addresses.append("asked")
         return next(rounds)
 
-    dashboard.serve(CIRCLE, flights, 0, announce=addresses.append, goes_on=goes_on)
+    dashboard.serve(flights, 0, announce=addresses.append, goes_on=goes_on)
     assert addresses[0].startswith("http://127.0.0.1:") and addresses[1:] == ["asked"]
 
 
@@ -242,8 +226,8 @@ def own_address() -> str:
 
 def test_the_live_page_says_the_same():
     flights = shown(circling(), circling(21, 0.1, judged=False))
-    table = dashboard.number_table(CIRCLE, flights, [30, 20])
-    assert not Tags(table).open
+    table = dashboard.number_table(flights, [30, 20])
+    check_tags(table)
     cells = re.findall(r"<tr><th>([^<]*)</th><td[^>]*>([^<]*)</td><td[^>]*>([^<]*)</td></tr>", table)
     said = {name: values for name, *values in cells}
     assert said["lap"] == ["1/3", "2/3"] and said[""] == ["flying", "gate frame"]

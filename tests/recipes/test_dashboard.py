@@ -41,8 +41,9 @@ def test_a_run_is_its_last_evaluation_of_the_deterministic_policy(runs: Path) ->
     dashboard = recipe_module("dashboard")
     assert dashboard.locate("run", "runs/a").name == "000002000_trajectory.csv"
     (source,) = dashboard.find(config(run="runs/a"))
-    assert (source.flight.title, source.folder, source.track.name) == ("a, 2,000 env_steps", runs / "a", "circle")
-    assert source.flight.trajectory.pixels is not None and source.flight.trajectory.value is not None
+    flight = source.flight
+    assert (flight.title, source.folder, flight.track.name) == ("a, 2,000 env_steps", runs / "a", "circle")
+    assert flight.trajectory.pixels is not None and flight.trajectory.value is not None
     assert dashboard.how_it_trained([source.folder]) == "Training curves: `tensorboard --logdir runs/a`"
 
 
