@@ -13,7 +13,7 @@ import zlib
 from collections import defaultdict
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -34,7 +34,9 @@ STATE = {
     "linear_velocity": ("vx", "vy", "vz"),
     "target_gate": ("target_gate",),
 }
-"""CSV columns of each field, in SI units; further columns are the time ``t`` and the action ``a0`` …"""
+"""CSV columns of each field, in SI units."""
+COLUMNS = ["t", *(column for names in STATE.values() for column in names)]
+"""First CSV columns, with the time; those of the action, ``a0`` …, follow."""
 
 HEAD = ("track", "control_dt", "outcome")
 TILT = "camera_tilt"
@@ -105,12 +107,8 @@ class Trajectory:
 
     def part(self, first: int, last: int) -> Trajectory:
         """Return rows ``first`` to ``last``, inclusive; the outcome is None if the last row is left out."""
-        values = {field.name: getattr(self, field.name) for field in fields(self)}
-        rows: dict[str, Any] = {
-            name: value[first : last + (name not in OF_STEPS)]
-            for name, value in values.items()
-            if isinstance(value, Tensor)
-        }
+        tensors = {name: value for name, value in vars(self).items() if isinstance(value, Tensor)}
+        rows: dict[str, Any] = {name: value[first : last + (name not in OF_STEPS)] for name, value in tensors.items()}
         return replace(self, **rows, outcome=self.outcome if last >= len(self.position) - 1 else None)
 
 
@@ -198,8 +196,7 @@ def write_trajectory(path: str | Path, trajectory: Trajectory, track: str | Path
         if trajectory.camera_tilt is not None:
             file.write(f"# {TILT}: {trajectory.camera_tilt!r}\n")
         writer = csv.writer(file, lineterminator="\n")
-        columns = [column for names in STATE.values() for column in names]
-        writer.writerow(["t", *columns, *names])
+        writer.writerow([*COLUMNS, *names])
         for index, row in enumerate(zip(*fields, actions, strict=True)):
             # 9 digits are read back as the same float32.
             cells = [f"{cell:.9g}" if isinstance(cell, float) else cell for part in row for cell in part]
@@ -237,17 +234,16 @@ def read_trajectory(path: str | Path) -> tuple[Trajectory, Track]:
         rows = list(csv.reader(line for line in lines if not line.startswith("#")))
     except csv.Error as error:
         raise ValueError(f"{path} holds no trajectory: {error}.") from error
-    expected = ["t", *(column for names in STATE.values() for column in names)]
-    if not head.keys() >= set(HEAD) or not rows or rows[0][: len(expected)] != expected:
-        raise ValueError(f"{path} holds no trajectory: its columns should be {', '.join(expected)}, a0 ...")
+    if not head.keys() >= set(HEAD) or not rows or rows[0][: len(COLUMNS)] != COLUMNS:
+        raise ValueError(f"{path} holds no trajectory: its columns should be {', '.join(COLUMNS)}, a0 ...")
     header, *rows = rows
-    actions = len(header) - len(expected)
+    actions = len(header) - len(COLUMNS)
     whole = all(len(row) == len(header) for row in rows) and text.endswith("\n")
     if not whole or len(rows) < 2 or any(rows[-1][-actions:]):
         raise ValueError(f"{path} was cut short: the last row, which has no action, is missing.")
     try:
         numbers = {name: _columns(rows, [header.index(column) for column in names]) for name, names in STATE.items()}
-        steps = _columns(rows[:-1], list(range(len(expected), len(header))))
+        steps = _columns(rows[:-1], list(range(len(COLUMNS), len(header))))
         control_dt, tilt = float(head["control_dt"]), float(head[TILT]) if TILT in head else None
     except ValueError as error:
         raise ValueError(f"{path} has a cell that is not a number: {error}.") from error
