@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Callable, Sequence
 from types import SimpleNamespace
 
 import pytest
@@ -16,7 +17,6 @@ from dreamer_racing.envs.torchrl_env import DroneRacingEnv
 from dreamer_racing.evaluation.evaluate import CRASHES, FINISHED, TIMEOUT, Evaluation, evaluate
 
 DT = 0.02
-STATE_KEY = ("privileged", "position")
 
 
 class ScriptedRace(EnvBase):
@@ -87,17 +87,24 @@ STATE = {"position": 3, "attitude": 4, "linear_velocity": 3, "body_rates": 3, "t
 SCRIPT = [[(2, "ground"), (9, FINISHED)], [(30, TIMEOUT)], [(4, "gate_frame"), (6, FINISHED), (1, "ground")]]
 
 
-def idle(n: int = len(SCRIPT)) -> TensorDictModule:
-    return TensorDictModule(lambda position: torch.zeros(n, 4), [("privileged", "position")], ["action"])
+def acting(act: Callable[[torch.Tensor], torch.Tensor]) -> TensorDictModule:
+    """A policy that makes actions (N, 4) of positions (N, 3)."""
+    return TensorDictModule(act, [("privileged", "position")], ["action"])
 
 
-def hover(env: DroneRacingEnv, **thrust: float) -> TensorDictModule:
-    """Hover; `env1=-1.0` lets environment 1 fly with that thrust."""
+def fly_idly(episodes: int, script: list[list[tuple[int, str]]] | None = None, **options) -> Evaluation:
+    """Evaluate a policy that does nothing in a scripted race."""
+    env = ScriptedRace(script or SCRIPT)
+    return evaluate(env, acting(lambda position: torch.zeros(len(position), 4)), episodes, **options)
+
+
+def hover(env: DroneRacingEnv, falling: Sequence[int] = ()) -> TensorDictModule:
+    """Hover, but in some environments without thrust."""
     action = torch.zeros(*env.batch_size, 4)
     action[:, 0] = env.worlds.parameters.hover_action
-    for name, value in thrust.items():
-        action[int(name[3:]), 0] = value
-    return TensorDictModule(lambda position: action.clone(), [("privileged", "position")], ["action"])
+    for index in falling:
+        action[index, 0] = -1.0
+    return acting(lambda position: action.clone())
 
 
 def race(num_envs: int, **arguments) -> DroneRacingEnv:
@@ -107,7 +114,7 @@ def race(num_envs: int, **arguments) -> DroneRacingEnv:
 
 @pytest.mark.parametrize(("episodes", "lengths"), [(1, [2]), (5, [2, 30, 4, 9, 30]), (7, [2, 30, 4, 9, 30, 6, 9])])
 def test_flies_the_episodes_dealt_to_each_environment_however_long_they_last(episodes, lengths):
-    result = evaluate(ScriptedRace(SCRIPT), idle(), episodes)
+    result = fly_idly(episodes)
     assert [episode.length for episode in result.episodes] == lengths
     assert [episode.reward_sum for episode in result.episodes] == lengths  # 1 a step: none of a neighbour's
     assert all(episode.speed_mean == episode.length for episode in result.episodes if episode.outcome not in CRASHES)
@@ -116,12 +123,12 @@ def test_flies_the_episodes_dealt_to_each_environment_however_long_they_last(epi
 def test_says_how_many_episodes_have_ended():
     told = []
     script = [[(2, "ground"), (3, "ground")], [(2, "ground"), (1, "ground")]]
-    evaluate(ScriptedRace(script), idle(2), episodes=3, on_episode=lambda *numbers: told.append(numbers))
+    fly_idly(3, script, on_episode=lambda *numbers: told.append(numbers))
     assert told == [(2, 3), (3, 3)]  # both worlds' first together
 
 
 def test_statistics_by_hand():
-    result = evaluate(ScriptedRace(SCRIPT), idle(), 5)
+    result = fly_idly(5)
     assert [episode.outcome for episode in result.episodes] == ["ground", TIMEOUT, "gate_frame", FINISHED, TIMEOUT]
     assert result.success_rate == pytest.approx(1 / 5)
     assert result.timeout_rate == pytest.approx(2 / 5)
@@ -142,12 +149,10 @@ def test_statistics_by_hand():
 def test_crashes_by_gate():
     """Environment 0 crashes after one gate, 1 after seven (2 laps and 1), 2 before any; 3 finishes."""
     script = [[(2, "ground")], [(14, "ground")], [(1, "gate_frame")], [(9, FINISHED)]]
-    result = evaluate(ScriptedRace(script), idle(4), 8)
+    result = fly_idly(8, script)
     assert [episode.crash_gate for episode in result.episodes] == [1, 1, 0, None] * 2
-    assert result.crashes_by_gate == {cause: [0, 0, 0] for cause in CRASHES} | {
-        "ground": [0, 4, 0],
-        "gate_frame": [2, 0, 0],
-    }
+    none = {cause: [0, 0, 0] for cause in CRASHES}
+    assert result.crashes_by_gate == none | {"ground": [0, 4, 0], "gate_frame": [2, 0, 0]}
 
 
 def test_a_hover_is_within_the_motors_limits_and_full_roll_at_full_thrust_is_not():
@@ -155,8 +160,7 @@ def test_a_hover_is_within_the_motors_limits_and_full_roll_at_full_thrust_is_not
         env = race(1, preset=preset, episode_steps=20)
         calm = evaluate(env, hover(env), 1)
         assert (calm.saturation_share, calm.thrust_shortfall) == pytest.approx((0.0, 0.0), abs=2e-3)  # a µs of throttle
-        roll = TensorDictModule(lambda position: torch.tensor([[1.0, 1.0, 0.0, 0.0]]), [STATE_KEY], ["action"])
-        rolled = evaluate(env, roll, 1)
+        rolled = evaluate(env, acting(lambda position: torch.tensor([[1.0, 1.0, 0.0, 0.0]])), 1)
         assert rolled.saturation_share > 0.2 and rolled.thrust_shortfall > 0.02
 
 
@@ -171,27 +175,25 @@ def test_action_change_by_hand():
         rows = [torch.full((4,), actions[index][step % len(actions[index])]) for index in range(2)]
         return torch.stack(rows) * scale
 
-    result = evaluate(ScriptedRace([[(3, TIMEOUT)], [(4, TIMEOUT)]]), TensorDictModule(act, [STATE_KEY], ["action"]), 4)
+    result = evaluate(ScriptedRace([[(3, TIMEOUT)], [(4, TIMEOUT)]]), acting(act), 4)
     assert [episode.action_change_mean for episode in result.episodes] == pytest.approx([0.5, 2 / 3, 0.5, 2 / 3])
     assert result.action_change_mean == pytest.approx((4 * 0.5 + 6 * 2 / 3) / 10)
 
 
 def test_an_action_that_is_not_finite_counts_as_zero_and_one_step_has_no_change():
-    act = TensorDictModule(lambda position: torch.full((1, 4), float("nan")), [STATE_KEY], ["action"])
-    assert evaluate(ScriptedRace([[(2, "invalid_action")]]), act, 1).action_change_mean == 0.0
-    assert evaluate(ScriptedRace([[(1, "invalid_action")]]), act, 2).action_change_mean == 0.0
+    lost = acting(lambda position: torch.full((1, 4), float("nan")))
+    for steps, episodes in ((2, 1), (1, 2)):
+        assert evaluate(ScriptedRace([[(steps, "invalid_action")]]), lost, episodes).action_change_mean == 0.0
 
 
 def test_joined_evaluations_have_all_episodes():
-    first, second = evaluate(ScriptedRace(SCRIPT), idle(), 2), evaluate(ScriptedRace(SCRIPT), idle(), 3)
-    joined = Evaluation.join([first, second])
+    joined = Evaluation.join([fly_idly(2), fly_idly(3)])
     assert [episode.length for episode in joined.episodes] == [2, 30, 2, 30, 4]
     assert joined.num_gates == 3 and len(joined.trajectories) == 2
 
 
 def test_json_has_the_promised_keys_and_nothing_that_is_not_json():
-    text = evaluate(ScriptedRace(SCRIPT), idle(), 4).to_json()
-    read = json.loads(text, parse_constant=pytest.fail)
+    read = json.loads(fly_idly(4).to_json(), parse_constant=pytest.fail)
     promised = {"success_rate", "gates_per_episode", "lap_time_best", "lap_time_mean", "speed_max"}
     assert promised | {"gate_offset_mean", "crashes"} <= set(read)
     assert read["num_episodes"] == len(read["episodes"]) == 4
@@ -199,24 +201,25 @@ def test_json_has_the_promised_keys_and_nothing_that_is_not_json():
 
 
 def test_no_lap_and_no_pass_are_none():
-    result = evaluate(ScriptedRace([[(1, "ground")]]), idle(1), 2)
+    result = fly_idly(2, [[(1, "ground")]])
     assert (result.lap_time_best, result.lap_time_mean, result.gate_offset_mean) == (None, None, None)
-    assert "best –" in result.summary()
-    assert "2 ground" in result.summary()
+    assert "best –" in result.summary() and "2 ground" in result.summary()
 
 
 def test_records_the_first_episode_only():
-    result = evaluate(ScriptedRace(SCRIPT), idle(), 6, num_trajectories=2)
-    crashed, late = result.trajectories
+    crashed, late = fly_idly(6, num_trajectories=2).trajectories
     assert (crashed.outcome, crashed.crashed, late.outcome, late.crashed) == ("ground", True, TIMEOUT, False)
     assert [len(crashed.position), len(crashed.action), len(late.position), len(late.action)] == [3, 2, 31, 30]
     assert crashed.pixels[:, 0, 0, 0].tolist() == [0, 1, 2]
     assert late.pixels[:, 0, 0, 0].tolist() == list(range(31))
     assert (crashed.position == 0).all()
     assert late.speed.tolist() == [0.0] + [30.0] * 30
-    blind = evaluate(ScriptedRace(SCRIPT), idle(), 3, num_trajectories=3, record_pixels=False).trajectories
+    assert crashed.part(0, 2).outcome == "ground"
+    part = crashed.part(1, 1)
+    assert (len(part.position), len(part.action), part.pixels[0, 0, 0, 0], part.outcome) == (1, 0, 1, None)
+    blind = fly_idly(3, num_trajectories=3, record_pixels=False).trajectories
     assert [(len(flight.position), flight.pixels) for flight in blind] == [(3, None), (31, None), (5, None)]
-    assert evaluate(ScriptedRace(SCRIPT), idle(), 3, num_trajectories=0).trajectories == []
+    assert fly_idly(3, num_trajectories=0).trajectories == []
 
 
 def test_what_a_critic_makes_of_each_state_is_recorded_beside_the_action():
@@ -227,21 +230,13 @@ def test_what_a_critic_makes_of_each_state_is_recorded_beside_the_action():
         asked.append(len(acted["action"]))
         return acted["pixels"][:, 0, 0, :1].float() * 10
 
-    result = evaluate(ScriptedRace(SCRIPT), idle(), 6, num_trajectories=2, value_function=value)
-    crashed, late = result.trajectories
+    crashed, late = fly_idly(6, num_trajectories=2, value_function=value).trajectories
     assert crashed.value.tolist() == [0.0, 10.0]
     assert late.value.tolist() == [10.0 * step for step in range(30)]
     assert asked == [2] * 30
     assert crashed.part(1, 2).value.tolist() == [10.0]
     assert crashed.camera_tilt == 30.0
-    assert evaluate(ScriptedRace(SCRIPT), idle(), 1).trajectories[0].value is None
-
-
-def test_part_of_a_flight():
-    flight = evaluate(ScriptedRace(SCRIPT), idle(), 1).trajectories[0]
-    assert flight.part(0, 2).outcome == "ground"
-    part = flight.part(1, 1)
-    assert (len(part.position), len(part.action), part.pixels[0, 0, 0, 0], part.outcome) == (1, 0, 1, None)
+    assert fly_idly(1).trajectories[0].value is None
 
 
 def test_recurrent_policy_starts_every_episode_afresh():
@@ -249,6 +244,7 @@ def test_recurrent_policy_starts_every_episode_afresh():
     counts = []
 
     def count(steps, is_init):
+        assert not torch.is_grad_enabled()
         steps = torch.where(is_init, 0.0, steps) + 1.0
         counts.append(steps.flatten().tolist())
         return torch.zeros(3, 4), steps
@@ -258,14 +254,13 @@ def test_recurrent_policy_starts_every_episode_afresh():
     env = TransformedEnv(ScriptedRace(SCRIPT), Compose(InitTracker(), primer))
     result = evaluate(env, policy, 5)
     assert [episode.length for episode in result.episodes] == [2, 30, 4, 9, 30]
-    first = [row[0] for row in counts]
-    assert first[:11] == [1, 2, *range(1, 10)]
+    assert [row[0] for row in counts[:11]] == [1, 2, *range(1, 10)]
     assert [row[1] for row in counts] == [*range(1, 31), *range(1, 31)]
 
 
-def test_hover_runs_out_of_time_and_no_thrust_falls():
+def test_hover_runs_out_of_time_and_no_thrust_falls_as_recorded():
     env = race(3)
-    result = evaluate(env, hover(env, env1=-1.0), 7)
+    result = evaluate(env, hover(env, falling=[1]), 7, num_trajectories=2)
     assert [episode.outcome for episode in result.episodes] == [TIMEOUT, "ground", TIMEOUT] * 2 + [TIMEOUT]
     assert result.success_rate == 0
     assert result.crashes["ground"] == 2
@@ -274,11 +269,7 @@ def test_hover_runs_out_of_time_and_no_thrust_falls():
     assert 0.51 < result.episodes[1].duration < 0.60
     assert result.episodes[0].length == 60
     assert result.episodes[0].speed_max < 0.01
-
-
-def test_recording_of_the_race_agrees_with_its_kinematics():
-    env = race(1)
-    fall = evaluate(env, hover(env, env0=-1.0), 1).trajectories[0]
+    fall = result.trajectories[1]
     assert fall.position[0].tolist() == pytest.approx([4.0, -2.5, 1.35])
     assert fall.position[-1, 2] < 0.05 + 1e-6
     mean_velocity = (fall.linear_velocity[1:] + fall.linear_velocity[:-1]) / 2
@@ -297,14 +288,3 @@ def test_recording_of_the_race_agrees_with_its_kinematics():
 def test_refuses_what_it_cannot_measure(arguments, episodes, message):
     with pytest.raises(ValueError, match=message):
         evaluate(race(1, **arguments), lambda tensordict: pytest.fail("must not fly"), episodes)
-
-
-def test_gradients_are_off():
-    seen = []
-
-    def act(position):
-        seen.append(torch.is_grad_enabled())
-        return torch.zeros(3, 4)
-
-    evaluate(ScriptedRace(SCRIPT), TensorDictModule(act, [("privileged", "position")], ["action"]), 1)
-    assert seen == [False, False]

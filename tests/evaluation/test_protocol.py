@@ -97,9 +97,8 @@ def test_both_policies_meet_the_same_starts():
     first, second = (
         protocol.fly(Falling(), WORLDS | race, 5, deterministic, num_trajectories=5) for deterministic in (True, False)
     )
-    starts = torch.stack([flight.position[0] for flight in first.trajectories])
-    assert torch.equal(starts, torch.stack([flight.position[0] for flight in second.trajectories]))
-    assert starts.std(0).min() > 0.1
+    starts, again = (torch.stack([one.position[0] for one in flown.trajectories]) for flown in (first, second))
+    assert torch.equal(starts, again) and starts.std(0).min() > 0.1
 
 
 def test_table_and_plots(tmp_path, figures):
@@ -115,13 +114,11 @@ def test_table_and_plots(tmp_path, figures):
         with Image.open(path) as image:
             assert image.width == 1350
     success, gates = figures[0].axes
-    for axes in (success, gates):
+    for axes, words in ((success, "0%"), (gates, "0.00")):
         assert axes.get_ylim()[0] == 0.0  # nobody finished, no gate was passed
-        words = "0%" if axes is success else "0.00"
         # Where no physics are drawn at random, both episodes are the same flight.
         assert [note.get_text() for note in axes.texts] == [f"{words}\nn = {n}" for n in (1, 2, 1, 2)]
-    for axes in figures[1].axes:
-        assert axes.get_ylim()[0] == 0.0
+    assert all(axes.get_ylim()[0] == 0.0 for axes in figures[1].axes)
 
 
 def test_conditions_that_a_track_has_no_room_for_are_refused_before_any_is_flown():
