@@ -105,9 +105,8 @@ def test_no_lap_is_drawn_where_none_was_flown(tmp_path):
     write_laps(tmp_path, 0, [None, 6.0, None, 5.0, 4.0])
     result = curves_of(tmp_path, quantities=["lap_time"], window=100.0)
     (curve,) = result.curves
-    for env_steps, value in ((1000, np.nan), (1500, np.nan), (2000, 6.0), (2500, np.nan), (3000, np.nan),
-                             (3500, np.nan), (4000, 5.0), (4500, 4.5), (5000, 4.0)):  # fmt: skip
-        np.testing.assert_allclose(at(curve, env_steps)[0], value, rtol=0.01, err_msg=str(env_steps))
+    drawn = [at(curve, env_steps)[0] for env_steps in range(1000, 5500, 500)]
+    np.testing.assert_allclose(drawn, [np.nan, np.nan, 6.0, np.nan, np.nan, np.nan, 5.0, 4.5, 4.0], rtol=0.01)
     assert result.problems == []
 
 
@@ -199,19 +198,16 @@ def test_curves_survive_their_file(tmp_path, window):
 # --- along a clock ---
 
 
-def write_timed_run(folder: Path, name: str, values, seconds, **settings) -> Path:
-    """A run whose return has these values after 1000, 2000 ... env_steps, and its clock these readings."""
-    run = write_run(folder, name, values, **settings)
-    rows = [(1000 * (i + 1), values[i], clock, clock / 2) for i, clock in enumerate(seconds)]
-    return write_metrics(run, ["episode/return", "wall_clock", "cpu_clock"], rows)
-
-
-@pytest.mark.parametrize(("axis", "longest"), [("hours", 4.0), ("core_hours", 2.0)])
-def test_runs_of_different_speed_are_compared_at_the_same_hour(tmp_path, axis, longest):
-    """The second run makes its env_steps in half the time: its values come at half the hour."""
-    write_timed_run(tmp_path, "ppo_circle_seed0", [1.0, 3.0], [7200.0, 14400.0], algorithm="ppo")
-    write_timed_run(tmp_path, "sac_circle_seed0", [1.0, 3.0], [3600.0, 7200.0], algorithm="sac")
+@pytest.mark.parametrize(("axis", "clock", "longest"), [("hours", "wall_clock", 4.0), ("core_hours", "cpu_clock", 2.0)])
+def test_runs_of_different_speed_are_compared_at_the_same_hour(tmp_path, axis, clock, longest):
+    """The second run makes its env_steps in half the time, the third notes none: it is left out by name."""
+    for algorithm, hour in (("ppo", 7200.0), ("sac", 3600.0)):
+        run = write_run(tmp_path, f"{algorithm}_circle_seed0", algorithm=algorithm)
+        rows = [(1000, 1.0, hour, hour / 2), (2000, 3.0, 2 * hour, hour)]
+        write_metrics(run, ["episode/return", "wall_clock", "cpu_clock"], rows)
+    write_run(tmp_path, "dreamer_v3_circle_seed0")
     drawn = curves_of(tmp_path, axis=axis)
+    assert f"dreamer_v3_circle_seed0 left out: it has no {clock}, which axis={axis} needs" in drawn.problems
     slow, fast = drawn.curves
     assert (drawn.axis, slow.x[-1], slow.key.algorithm) == (axis, longest, "ppo")
     for curve, hours, value in ((slow, 0.75, 2.0), (fast, 0.375, 2.0), (fast, 0.5, 3.0)):
@@ -221,14 +217,6 @@ def test_runs_of_different_speed_are_compared_at_the_same_hour(tmp_path, axis, l
     again = read_curves(tmp_path / "curves.csv")
     assert again.axis == axis
     np.testing.assert_allclose(again.curves[0].x, slow.x, rtol=1e-5)
-
-
-def test_a_run_without_the_clock_is_left_out_by_name(tmp_path):
-    write_timed_run(tmp_path, "ppo_circle_seed0", [1.0, 3.0], [3600.0, 7200.0], algorithm="ppo")
-    write_run(tmp_path, "sac_circle_seed0", algorithm="sac")
-    drawn = curves_of(tmp_path, axis="core_hours")
-    assert [curve.key.algorithm for curve in drawn.curves] == ["ppo"]
-    assert "sac_circle_seed0 left out: it has no cpu_clock, which axis=core_hours needs" in drawn.problems
     with pytest.raises(ValueError, match=r"axis=minutes: must be one of env_steps, hours, core_hours"):
         curves_of(tmp_path, axis="minutes")
 
@@ -262,10 +250,10 @@ def test_names_say_the_variant(tmp_path, name, settings, key):
     assert run.key == key
 
 
-def tell(run: Path, *overrides: str) -> Path:
-    """Store what a command line set."""
-    (run / "overrides.yaml").write_text(yaml.safe_dump(list(overrides)))
-    return run
+def variants(folder: Path) -> list[str]:
+    """The variants of a folder's curves."""
+    runs, _ = read_runs(find_runs([folder]))
+    return [key.variant for key in group_runs(runs)]
 
 
 def test_mixed_configurations_are_curves_of_their_own_named_by_the_overrides_that_differ(tmp_path):
@@ -273,7 +261,8 @@ def test_mixed_configurations_are_curves_of_their_own_named_by_the_overrides_tha
         settings = {"env": {"preset": "faithful"}} if seed == 2 else {"decoys": "paper"} if seed == 3 else {}
         name = f"dreamer_v3_circle_2026010{seed}"  # as recipes name them
         run = write_run(tmp_path, name, [float(seed)] * 2, seed=seed, **{"decoys": None} | settings)
-        tell(run, f"seed={seed}", "track=circle", "logger.every=5", *given)
+        overrides = [f"seed={seed}", "track=circle", "logger.every=5", *given]
+        (run / "overrides.yaml").write_text(yaml.safe_dump(overrides))
     curves = curves_of(tmp_path).curves
     assert [(curve.key.variant, curve.centre[-1], curve.seeds.max()) for curve in curves] == [
         ("", 0.5, 2),  # of both that are set alike
@@ -287,8 +276,7 @@ def test_settings_name_curves_whose_command_lines_do_not(tmp_path):
     for seed, (preset, tilt) in enumerate((("easy", 25), ("faithful", 25), ("faithful", 20))):
         env = {"env": {"preset": preset, "camera_tilt": tilt, "zoom": seed}}
         write_run(tmp_path, f"dreamer_v3_circle_paper_seed{seed}", seed=seed, device=f"cuda:{seed}", **env)
-    runs, _ = read_runs(find_runs([tmp_path]))
-    assert [key.variant for key in group_runs(runs)] == [
+    assert variants(tmp_path) == [
         "paper env.camera_tilt=20, env.preset=faithful, …",  # no more than tells them apart: not their zoom
         "paper env.camera_tilt=25, env.preset=easy, …",
         "paper env.camera_tilt=25, env.preset=faithful, …",
@@ -298,12 +286,10 @@ def test_settings_name_curves_whose_command_lines_do_not(tmp_path):
 def test_a_track_file_that_was_edited_between_two_runs_makes_two_curves(tmp_path):
     for seed, described in enumerate(('{"name": "mine"}', '{"name": "mine", "laps": 2}')):
         write_run(tmp_path, f"ppo_mine_seed{seed}", seed=seed, track="mine.yaml", track_description=described)
-    runs, _ = read_runs(find_runs([tmp_path]))
-    assert [len(key.variant) for key in group_runs(runs)] == [len("track_description=01234567")] * 2
+    assert [len(variant) for variant in variants(tmp_path)] == [len("track_description=01234567")] * 2
     for seed, folder in enumerate(("a", "b")):  # from before tracks were noted
         write_run(tmp_path / "old", f"ppo_mine_seed{seed}", seed=seed, track=f"{folder}/mine.yaml")
-    runs, _ = read_runs(find_runs([tmp_path / "old"]))
-    assert [key.variant for key in group_runs(runs)] == ["(1)", "(2)"]
+    assert variants(tmp_path / "old") == ["(1)", "(2)"]
 
 
 def test_a_setting_that_an_older_version_did_not_have_is_no_difference(tmp_path):
@@ -311,10 +297,8 @@ def test_a_setting_that_an_older_version_did_not_have_is_no_difference(tmp_path)
         write_run(tmp_path, f"dreamer_v3_circle_seed{seed}", seed=seed, **decoys)
     assert curves_of(tmp_path).curves[0].seeds.max() == 3
     write_run(tmp_path, "dreamer_v3_circle_seed3", seed=3, decoys={"count": 2})
-    curves = curves_of(tmp_path).curves  # unlike seed 2, but not unlike the first
-    assert [(curve.key.variant, curve.seeds.max()) for curve in curves] == [
-        ("decoys.count=2", 1), ("decoys.count=4", 3)
-    ]  # fmt: skip
+    drawn = {curve.key.variant: curve.seeds.max() for curve in curves_of(tmp_path).curves}
+    assert drawn == {"decoys.count=2": 1, "decoys.count=4": 3}  # unlike seed 2, but not unlike the first
 
 
 def test_runs_that_differ_in_what_does_not_matter_are_one_curve(tmp_path):
@@ -340,20 +324,23 @@ def test_of_the_same_seed_twice_the_longer_run_counts(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("spoil", "words"),
+    ("name", "content", "words"),
     [
-        (lambda run: (run / "metrics.csv").unlink(), "it has no metrics.csv"),
-        (lambda run: (run / "config.yaml").unlink(), "it has no config.yaml"),
-        (lambda run: (run / "metrics.csv").write_text(""), "metrics.csv has no rows"),
-        (lambda run: (run / "metrics.csv").write_text("env_steps,episode/return\n"), "metrics.csv has no rows"),
-        (lambda run: (run / "metrics.csv").write_bytes(b"\x89PNG\r\n\x00\xff\n" * 9), "no column env_steps"),
-        (lambda run: (run / "config.yaml").write_text("a: [b"), "config.yaml is not YAML"),
-        (lambda run: (run / "config.yaml").write_text("just words"), "config.yaml holds no settings"),
+        ("metrics.csv", None, "it has no metrics.csv"),
+        ("config.yaml", None, "it has no config.yaml"),
+        ("metrics.csv", b"", "metrics.csv has no rows"),
+        ("metrics.csv", b"env_steps,episode/return\n", "metrics.csv has no rows"),
+        ("metrics.csv", b"\x89PNG\r\n\x00\xff\n" * 9, "no column env_steps"),
+        ("config.yaml", b"a: [b", "config.yaml is not YAML"),
+        ("config.yaml", b"just words", "config.yaml holds no settings"),
     ],
 )
-def test_unreadable_runs_are_named_and_left_out(tmp_path, spoil, words):
+def test_unreadable_runs_are_named_and_left_out(tmp_path, name, content, words):
     write_run(tmp_path, "dreamer_v3_circle_seed0", [5.0, 5.0])
-    spoil(write_run(tmp_path, "dreamer_v3_circle_seed1", [9.0, 9.0], seed=1))
+    spoilt = write_run(tmp_path, "dreamer_v3_circle_seed1", [9.0, 9.0], seed=1) / name
+    spoilt.unlink()
+    if content is not None:
+        spoilt.write_bytes(content)
     result = curves_of(tmp_path)
     assert at(result.curves[0], 1500)[::3] == (5.0, 1)
     (problem,) = result.problems
@@ -408,12 +395,11 @@ def test_evaluations_by_env_steps_then_those_after_training(tmp_path):
     folder.mkdir()
     for name in ("000000200", "000000100", "000000100_stochastic"):
         (folder / f"{name}_trajectory.csv").touch()
-    names = ("evaluation", "evaluation_2", "evaluation_10", "evaluation_x")
-    after = [tmp_path / name / "evaluations" for name in names]
+    after = [tmp_path / f"evaluation{suffix}" / "evaluations" for suffix in ("", "_2", "_10", "_x")]
     for place in after:
         place.mkdir(parents=True)
-        (place / "deterministic_trajectory.csv").touch()
-        (place / "stochastic_trajectory.csv").touch()
+        for policy in ("deterministic", "stochastic"):
+            (place / f"{policy}_trajectory.csv").touch()
     first, second, *others = evaluation_files(tmp_path, "_trajectory.csv")
     assert [first, second] == [folder / f"000000{n}00_trajectory.csv" for n in (1, 2)]
     assert others == [place / "deterministic_trajectory.csv" for place in after[:3]]
