@@ -23,22 +23,18 @@ from dreamer_racing.figures.flights import CELL, plot_top_down, plot_tracks
 from dreamer_racing.figures.report import ReturnReport
 from dreamer_racing.modules import Interface
 from tests.dreamers import learner_of
+from tests.figures.test_flights import level_flight
 
 
-def straight_flight(track, steps: int = 60, outcome: str | None = "ground") -> Trajectory:
-    """From the start pose along its heading, 0 to 8 m/s."""
+def straight_flight(track, outcome: str = "ground") -> Trajectory:
+    """In 60 steps from the start pose along its heading, 0 to 8 m/s."""
     heading = math.radians(track.start_yaw_degrees)
     direction = torch.tensor([math.cos(heading), math.sin(heading), 0.0])
-    speed = torch.linspace(0, 8, steps + 1).unsqueeze(1)
-    angle = torch.full((steps + 1,), heading)
-    return Trajectory(
-        position=torch.tensor(track.start_position) + 0.02 * speed.cumsum(0) * direction,
+    speed, angle = torch.linspace(0, 8, 61).unsqueeze(1), torch.full((61,), heading)
+    return level_flight(
+        torch.tensor(track.start_position) + 0.02 * speed.cumsum(0) * direction,
         attitude=from_roll_pitch_yaw(0 * angle, 0 * angle, angle),
         linear_velocity=speed * direction,
-        target_gate=torch.zeros(steps + 1, dtype=torch.int64),
-        action=torch.zeros(steps, 4),
-        pixels=None,
-        control_dt=0.02,
         outcome=outcome,
     )
 
@@ -76,11 +72,10 @@ def test_path_is_coloured_by_speed_and_ends_with_the_crash(tmp_path, figures):
     np.testing.assert_allclose(line.get_array(), np.linspace(0, 8, 61)[1:], rtol=1e-6)
     np.testing.assert_allclose(line.get_segments()[-1][1], trajectory.position[-1, :2], rtol=1e-6)
     assert len(arrows.get_offsets()) == 13  # 1.2 s, one every 0.1 s and one at the start
-    markers = {marker.get_marker(): marker.get_xydata()[0] for marker in axes.lines if marker.get_marker() != "None"}
-    np.testing.assert_allclose(markers["o"], track.start_position[:2])
-    np.testing.assert_allclose(markers["x"], trajectory.position[-1, :2])
-    marks = [marker for marker in axes.lines if marker.get_marker() in ("o", "x")]
-    assert all(mark.get_zorder() < line.get_zorder() for mark in marks), "a short flight would be hidden"
+    marks = {mark.get_marker(): mark for mark in axes.lines if mark.get_marker() in ("o", "x")}
+    np.testing.assert_allclose(marks["o"].get_xydata()[0], track.start_position[:2])
+    np.testing.assert_allclose(marks["x"].get_xydata()[0], trajectory.position[-1, :2])
+    assert all(mark.get_zorder() < line.get_zorder() for mark in marks.values()), "a short flight would be hidden"
     assert axes.get_title(loc="left") == "circle: 1.20 s, up to 8.0 m/s (ground)"
     plot_top_down(track, straight_flight(track, outcome="finished"), tmp_path / "plot.png")
     assert "x" not in [line.get_marker() for line in figures[1].axes[0].lines]
@@ -124,8 +119,7 @@ def test_flights_are_drawn_with_the_cameras_that_they_were_flown_by(tmp_path):
 def test_lost_state_can_be_drawn(tmp_path):
     track = load_track("circle")
     trajectory = straight_flight(track, outcome="non_finite_state")
-    trajectory.position[-1] = math.nan
-    trajectory.linear_velocity[-1] = math.nan
+    trajectory.position[-1] = trajectory.linear_velocity[-1] = math.nan
     plot_top_down(track, trajectory, tmp_path / "plot.png")
     assert len(top_down_frames(track, trajectory, size=64)) == 61
 

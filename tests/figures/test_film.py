@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
@@ -22,7 +23,7 @@ from dreamer_racing.envs.tracks import load_track
 from dreamer_racing.evaluation.trajectory import Trajectory
 from dreamer_racing.figures import film
 from dreamer_racing.figures.report import chase_beside_onboard
-from tests.figures.test_flights import random_flight
+from tests.figures.test_flights import level_flight, random_flight
 
 PALETTE = np.array([[200, 30, 30], [30, 200, 30], [30, 30, 200], [240, 240, 240]], dtype=np.uint8)
 
@@ -35,15 +36,11 @@ def blocks(frames: int, height: int = 16, width: int = 16) -> np.ndarray:
     return video
 
 
-def flight(steps: int = 10) -> Trajectory:
-    position = torch.zeros(steps + 1, 3)
-    position[:, 0] = torch.linspace(-4, 4, steps + 1)
-    attitude = torch.zeros(steps + 1, 4)
-    attitude[:, 0] = 1
-    velocity = torch.tensor([2.0, 0, 0]).expand(steps + 1, 3)
-    gate = torch.zeros(steps + 1, dtype=torch.int64)
-    pixels = torch.as_tensor(blocks(steps + 1))
-    return Trajectory(position, attitude, velocity, gate, torch.zeros(steps, 4), pixels, 0.02, "ground")
+def flight() -> Trajectory:
+    """In 10 steps along x, from −4 to 4 m."""
+    along = torch.tensor([1.0, 0.0, 0.0])
+    moving = {"linear_velocity": (2.0 * along).repeat(11, 1), "pixels": torch.as_tensor(blocks(11))}
+    return level_flight(torch.linspace(-4, 4, 11)[:, None] * along, **moving, outcome="ground")
 
 
 @pytest.mark.parametrize(
@@ -221,8 +218,15 @@ LEVEL = np.array([[1.0, 0.0, 0.0, 0.0]])
 GATE, BEGINNING = np.array([0]), np.array([0.0])
 
 
-def view_of_circle(size: int = 64, num_envs: int = 1) -> ChaseView:
-    return ChaseView(load_track("circle"), load_preset("easy"), num_envs, size)
+def view_of_circle(num_envs: int = 1) -> ChaseView:
+    return ChaseView(load_track("circle"), load_preset("easy"), num_envs, size=64)
+
+
+@pytest.fixture
+def view() -> Iterator[ChaseView]:
+    view = view_of_circle()
+    yield view
+    view.close()
 
 
 def start() -> np.ndarray:
@@ -231,45 +235,36 @@ def start() -> np.ndarray:
 
 def flight_of(rows: int, image_size: int = 16) -> Trajectory:
     """A drone that hovers at the start of Circle; its images are grey."""
-    position = torch.tensor(start(), dtype=torch.float32).expand(rows, 3).clone()
-    attitude = torch.tensor(LEVEL, dtype=torch.float32).expand(rows, 4)
-    gate = torch.zeros(rows, dtype=torch.int64)
-    pixels = torch.full((rows, image_size, image_size, 3), 100, dtype=torch.uint8)
-    return Trajectory(position, attitude, torch.zeros(rows, 3), gate, torch.zeros(rows - 1, 4), pixels, 0.02, None)
+    position = torch.tensor(start(), dtype=torch.float32).repeat(rows, 1)
+    return level_flight(position, pixels=torch.full((rows, image_size, image_size, 3), 100, dtype=torch.uint8))
 
 
-def test_the_drone_is_below_the_middle_of_the_picture_and_large_enough(monkeypatch: pytest.MonkeyPatch) -> None:
-    view = view_of_circle()
+def test_the_drone_is_below_the_middle_of_the_picture_and_large_enough(view, monkeypatch) -> None:
     (frame,) = view.draw(start(), LEVEL, GATE, BEGINNING)
     monkeypatch.setattr(chase, "DRONE_GROUP", chase.HALL_GROUP)
     (empty,) = view.draw(start(), LEVEL, GATE, BEGINNING)
-    view.close()
     rows, columns = np.nonzero((frame != empty).any(-1))
     assert 60 < len(rows) < 800, "the drone, and nothing but it: some percent of 64 × 64 pixels"
     assert abs(columns.mean() - 31.5) < 2 and 32 < rows.mean() < 50
     assert np.ptp(columns) > 10
 
 
-def test_it_looks_towards_the_next_gate_whatever_the_drone_does() -> None:
+def test_it_looks_towards_the_next_gate_whatever_the_drone_does(view) -> None:
     """The same picture of the hall for a drone that has turned; another for another gate."""
-    view = view_of_circle()
     turned = np.array([[math.cos(1.0), 0.0, 0.0, math.sin(1.0)]])
     (ahead,) = view.draw(start(), LEVEL, GATE, BEGINNING)
     (askew,) = view.draw(start(), turned, GATE, BEGINNING)
     (other,) = view.draw(start(), LEVEL, GATE + 2, BEGINNING)
-    view.close()
     assert 0.0 < (ahead != askew).any(-1).mean() < 0.3 < (ahead != other).any(-1).mean()
     orange = (ahead[..., 0] > 180) & (ahead[..., 1] < 90) & (ahead[..., 2] < 60)
     assert orange.sum() > 20, "the gate"
 
 
-def test_the_camera_turns_to_the_next_gate_with_a_delay(monkeypatch: pytest.MonkeyPatch) -> None:
-    view = view_of_circle()
+def test_the_camera_turns_to_the_next_gate_with_a_delay(view, monkeypatch) -> None:
     drawn: list[np.ndarray] = []
     monkeypatch.setattr(view, "_film", lambda position, attitude, heading, out: drawn.append(heading.copy()))
     for gate, time in ((0, 0.0), (1, 0.02), (1, 0.02), *((1, 0.02 * row) for row in range(2, 200)), (0, 0.0)):
         view.draw(start(), LEVEL, np.array([gate]), np.array([time]))
-    view.close()
     aims = [view._aims[gate] - start()[0, :2] for gate in (0, 1)]
     first, second = (aim / np.linalg.norm(aim) for aim in aims)
     share = 1 - math.exp(-0.02 / chase.TURNING_TIME)
@@ -283,47 +278,39 @@ def test_the_camera_turns_to_the_next_gate_with_a_delay(monkeypatch: pytest.Monk
     assert steps.max() < 2 * share
 
 
-def test_the_eye_stays_in_the_hall() -> None:
-    track = load_track("circle")
-    view, eyes = view_of_circle(), []
+def test_the_eye_stays_in_the_hall(view) -> None:
+    track, eyes = load_track("circle"), []
     view._scene.draw = lambda eye, *_: eyes.append(eye.copy())  # type: ignore[method-assign]
     for corner in ((track.bounds_low[0], track.bounds_low[1], 0.0), (track.bounds_high[0], track.bounds_high[1], 9.0)):
         for gate in range(track.num_gates):
             view.draw(np.array([corner]), LEVEL, np.array([gate]), BEGINNING)
-    view.close()
     low, high = np.array(track.bounds_low), np.array(track.bounds_high)
     assert len(eyes) == 2 * track.num_gates and all((low < eye).all() and (eye < high).all() for eye in eyes)
 
 
-def test_each_drone_has_a_picture_of_its_own() -> None:
-    view, alone = view_of_circle(num_envs=2), view_of_circle()
+def test_each_drone_has_a_picture_of_its_own(view) -> None:
+    both = view_of_circle(num_envs=2)
     places = np.concatenate((start(), np.add(start(), (1.0, 1.0, 0.0))))
-    pictures = view.draw(places, LEVEL.repeat(2, 0), np.array([0, 1]), np.zeros(2))
-    assert np.array_equal(pictures[0], alone.draw(start(), LEVEL, GATE, BEGINNING)[0])
-    assert np.array_equal(pictures[1], alone.draw(places[1:], LEVEL, GATE + 1, BEGINNING)[0])
-    view.close()
-    alone.close()
+    pictures = both.draw(places, LEVEL.repeat(2, 0), np.array([0, 1]), np.zeros(2))
+    both.close()
+    assert np.array_equal(pictures[0], view.draw(start(), LEVEL, GATE, BEGINNING)[0])
+    assert np.array_equal(pictures[1], view.draw(places[1:], LEVEL, GATE + 1, BEGINNING)[0])
 
 
-def test_beside_it_stands_what_the_drone_sees() -> None:
-    trajectory = flight_of(2)
-    view = view_of_circle(size=60)
+def test_beside_it_stands_what_the_drone_sees(view) -> None:
+    trajectory = flight_of(2, image_size=20)
     frames = chase_beside_onboard(view, trajectory)
     outside = chase_beside_onboard(view, replace(trajectory, pixels=None))
-    assert outside.shape == (2, 60, 60, 3) and frames.shape == (2, 60, 60 + 8 + 48, 3)
-    assert np.array_equal(frames[:, :, :60], outside)
-    assert (frames[:, 6:54, 68:] == 100).all() and (frames[:, :6, 60:] == 255).all()
-    large = chase_beside_onboard(view, flight_of(1, image_size=100))
-    assert large.shape == (1, 60, 60 + 8 + 50, 3)
-    view.close()
+    assert outside.shape == (2, 64, 64, 3) and frames.shape == (2, 64, 64 + 8 + 60, 3)
+    assert np.array_equal(frames[:, :, :64], outside)
+    assert (frames[:, 2:62, 72:] == 100).all() and (frames[:, :2, 64:] == 255).all()
+    assert chase_beside_onboard(view, flight_of(1, image_size=100)).shape == (1, 64, 64 + 8 + 50, 3)
 
 
-def test_a_flight_is_filmed_up_to_its_first_non_finite_state() -> None:
+def test_a_flight_is_filmed_up_to_its_first_non_finite_state(view) -> None:
     trajectory = flight_of(3)
     trajectory.position[1:] = torch.nan
-    view = view_of_circle(size=32)
     frames = chase_beside_onboard(view, replace(trajectory, pixels=None))
-    view.close()
     assert frames[0].any() and not frames[1:].any()
 
 

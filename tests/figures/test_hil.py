@@ -21,13 +21,14 @@ from dreamer_racing.figures.hil import LATENCY, REPORT, TRACKING, TRAJECTORY, tr
 from dreamer_racing.figures.hil_numbers import Response, read_flown, tracking_error
 from dreamer_racing.hil import recording
 from dreamer_racing.hil.chain import ChainConfig, FlightChain, Inputs, describe_inputs, describe_outputs
+from dreamer_racing.hil.flyer import Flyer
 from dreamer_racing.hil.operator import Operator
 from dreamer_racing.hil.pose import PosePacket, Received
 from dreamer_racing.hil.recording import FILE, TRACK, Flight, FlightRecorder
 from dreamer_racing.hil.safety import SafetyLimits
 from dreamer_racing.hil.stamping import Stamping
 from dreamer_racing.hil.vehicle import GRAVITY, Pose, Setpoint
-from tests.figures.test_flights import random_flight
+from tests.figures.test_flights import level_flight
 
 CIRCLE = load_track("circle")  # gates of 4 m from the middle, at 0, 90, 180 and 270 degrees, flown anticlockwise
 RADIUS, SPIN, ANGLE = 4.2, 2.0, -0.5  # m, rad/s, rad at the start
@@ -41,21 +42,14 @@ def gate_time(number: int) -> float:
     return OFF + (0.5 * math.pi * number - ANGLE) / SPIN
 
 
-@dataclass
-class Wobble:
+class Wobble(Flyer):
     """Asks for a constant thrust, and for a roll rate that swings."""
 
-    rate: float = 1.0 / PERIOD
-    camera: None = None
-
-    def reset(self) -> None:
-        pass
+    rate = 1.0 / PERIOD
+    camera = None
 
     def act(self, pose: Pose, image: np.ndarray | None, target_gate: int) -> Setpoint:
         return Setpoint(12.0, np.array([3.0 * math.sin(9.0 * pose.time), math.cos(7.0 * pose.time), 0.0]))
-
-    def prepare(self) -> None:
-        pass
 
 
 @dataclass
@@ -200,10 +194,9 @@ def test_gates_and_laps_are_those_flown(report):
 def test_the_summary_of_a_flight(report):
     assert (report["actor"], report["track"], report["rate_hz"]) == ("wobble", "circle", 50.0)
     assert report["armed_s"] == pytest.approx(gate_time(7) - ENABLED, abs=PERIOD)
-    assert report["flown"]["gates"] == 8
-    assert report["flown"]["speed_max"] == pytest.approx(RADIUS * SPIN, rel=1e-4)
-    speed = RADIUS * SPIN
-    assert report["flown"]["distance_m"] == pytest.approx(speed * (gate_time(7) - OFF), abs=speed * PERIOD)
+    flown, speed = report["flown"], RADIUS * SPIN
+    assert flown["gates"] == 8 and flown["speed_max"] == pytest.approx(speed, rel=1e-4)
+    assert flown["distance_m"] == pytest.approx(speed * (gate_time(7) - OFF), abs=speed * PERIOD)
 
 
 def test_rates_follow_with_the_lag_put_in(report):
@@ -242,10 +235,9 @@ def test_too_few_measurements_give_no_error():
 
 
 def test_the_flight_beside_a_simulated_one(tmp_path, flown, figures):
-    simulated = random_flight(steps=50, outcome="timeout")
-    simulated.position[:] = torch.stack((torch.linspace(-2.0, 2.0, 51), torch.zeros(51), torch.ones(51)), dim=1)
-    simulated.linear_velocity[:] = torch.tensor([4.0, 0, 0])
-    simulated.target_gate[:] = 0
+    position = torch.stack((torch.linspace(-2.0, 2.0, 51), torch.zeros(51), torch.ones(51)), dim=1)
+    velocity = torch.tensor([4.0, 0, 0]).expand(51, 3)
+    simulated = level_flight(position, linear_velocity=velocity, outcome="timeout")
     write_trajectory(tmp_path / "straight.csv", simulated, "circle")
     lines = write_report(flown, tmp_path / "straight.csv")
     latency, beside, tracking = figures
@@ -287,12 +279,15 @@ def test_a_trajectory_has_the_poses_that_the_flyer_chose_by(flown):
 
 
 def test_a_flight_that_was_never_armed(tmp_path):
+    for name in (TRAJECTORY, TRACKING):
+        (tmp_path / name).write_text("of an earlier report")
     lines = write_report(Flown(tmp_path, arm=False).fly(50))
+    assert sorted(path.name for path in tmp_path.iterdir()) == sorted([FILE, REPORT, LATENCY])
     assert "armed for 0.00 s of 0.98 s, ended: never armed" in lines[0]
     report = reported(tmp_path)
     assert (report["gates"], report["latency"]["of"], report["figures"]) == ([], "all ticks", [LATENCY])
     assert report["latency"]["stages"]["sent"]["p50_ms"] == pytest.approx(4.0)
-    assert not (tmp_path / TRAJECTORY).exists() and not any(report["tracking"].values())
+    assert not any(report["tracking"].values())
     with pytest.raises(ValueError, match="this flight was never armed, or for one tick only"):
         write_report(tmp_path, tmp_path)
 
@@ -375,11 +370,3 @@ def test_what_is_compared_with_must_be_there(tmp_path, flown):
         write_report(flown, tmp_path / "metrics.csv")
     with pytest.raises(FileNotFoundError, match="There is no flight"):
         write_report(tmp_path / "nowhere")
-
-
-def test_figures_of_an_earlier_report_do_not_stay(tmp_path):
-    folder = Flown(tmp_path, arm=False).fly(20)
-    for name in (TRAJECTORY, TRACKING):
-        (folder / name).write_text("of an earlier report")
-    write_report(folder)
-    assert sorted(path.name for path in folder.iterdir()) == sorted([FILE, REPORT, LATENCY])
