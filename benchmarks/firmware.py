@@ -28,8 +28,7 @@ from dreamer_racing.hil.links.sitl import encode_sitl
 from dreamer_racing.hil.safety_limits import SafetyLimits
 from dreamer_racing.hil.sticks import ThrustMap
 from dreamer_racing.plant.delivery import Delivery
-from dreamer_racing.plant.firmware_step import FirmwareStep, Radio, SteppedFirmware
-from dreamer_racing.plant.lock_step import LockStep
+from dreamer_racing.plant.lock_step import FirmwareStep, LockStep, Radio, SteppedFirmware
 from dreamer_racing.plant.pilot import PilotFlyer
 from dreamer_racing.plant.vehicle import PlantVehicle
 

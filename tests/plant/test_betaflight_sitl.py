@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 import struct
 from collections.abc import Callable
-from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
@@ -13,21 +12,18 @@ import pytest
 
 from dreamer_racing.envs.drone.parameters import GRAVITY
 from dreamer_racing.envs.race.gates import CrashCause
-from dreamer_racing.export.onnx_actor import read_contract
-from dreamer_racing.hil.betaflight import rate_map
-from dreamer_racing.hil.chain import ChainConfig, FlightChain
+from dreamer_racing.hil.chain import FlightChain
 from dreamer_racing.hil.links.link import ChannelLink
 from dreamer_racing.hil.links.sitl import encode_sitl
-from dreamer_racing.hil.safety_limits import SafetyLimits
-from dreamer_racing.hil.sticks import ThrustMap
 from dreamer_racing.hil.vehicle import Command, Pose
 from dreamer_racing.plant.betaflight_sitl import CONVENTIONS, BetaflightSitl, convention_of, decode_motors, encode_state
 from dreamer_racing.plant.delivery import Delivery
-from dreamer_racing.plant.firmware_step import FirmwareStep, Radio
+from dreamer_racing.plant.lock_step import FirmwareStep, Radio
 from dreamer_racing.plant.pilot import PilotFlyer
 from dreamer_racing.plant.process import Plant
 from dreamer_racing.plant.vehicle import PlantVehicle
 from tests.firmware import FAILSAFE, MIN_CHECK, Firmware
+from tests.plant.conftest import RATES, THRUST, chain_of
 
 FIRMWARES = ("2026.6", "before")
 
@@ -92,27 +88,6 @@ def test_motors_are_put_in_order_and_within_limits() -> None:
         assert decode_motors(bad, CONVENTIONS["2026.6"]) is None
 
 
-@pytest.mark.parametrize(
-    ("motors", "axis", "sign"),
-    [
-        ((0.055, 0.055, 0.98, 0.98), 0, 1),  # roll right: measured answers of the firmware, the body clamped
-        ((1.0, 0.055, 1.0, 0.055), 1, 1),  # pitch forward, nose down
-        ((0.23, 0.77, 0.77, 0.23), 2, -1),  # yaw right
-    ],
-)
-@pytest.mark.parametrize("version", FIRMWARES)
-def test_the_firmwares_answers_turn_the_vehicle_where_they_mean_to(
-    motors: tuple[float, ...], axis: int, sign: int, version: str
-) -> None:
-    plant, firmware = closed(version)
-    take_off(plant, firmware)
-    firmware.motors = lambda: np.array(motors)
-    plant.advance_to(plant.time + 0.03)
-    rates = plant.vehicle.pose().body_rates
-    assert np.abs(rates).argmax() == axis and sign * rates[axis] > 0.2
-    assert firmware.gyro[axis] * sign > 0.0  # and the firmware sees the turn with the sign that it asked for
-
-
 @pytest.mark.parametrize("version", FIRMWARES)
 def test_idle_motors_arm_and_leave_it_on_the_stand(version: str) -> None:
     plant, firmware = closed(version)
@@ -141,16 +116,6 @@ def test_the_closed_loop_holds_the_rate_that_the_firmware_wants(version: str, ax
     assert plant.vehicle.crash is CrashCause.NONE
 
 
-@pytest.mark.parametrize("version", FIRMWARES)
-def test_the_wrong_dialect_does_not_fly(version: str) -> None:
-    plant, firmware = closed(version)
-    take_off(plant, firmware)
-    firmware.version = next(other for other in FIRMWARES if other != version)
-    firmware.rates[0] = 0.5
-    plant.advance_to(plant.time + 1.0)
-    assert np.abs(plant.vehicle.pose().body_rates - firmware.rates).max() > 1.0 or plant.vehicle.crash
-
-
 def test_silence_of_the_firmware_cuts_the_motors_until_it_has_been_disarmed() -> None:
     plant, firmware = closed("2026.6")
     take_off(plant, firmware)
@@ -170,11 +135,6 @@ def test_silence_of_the_firmware_cuts_the_motors_until_it_has_been_disarmed() ->
     assert plant.vehicle.armed
 
 
-def test_an_unknown_firmware_is_refused() -> None:
-    with pytest.raises(ValueError, match="betaflight=new: must be a firmware release, as 4.6 or 2026.6, or before"):
-        BetaflightSitl(PlantVehicle("circle"), lambda data: None, "new")
-
-
 @pytest.mark.parametrize(
     ("release", "convention"),
     [
@@ -187,11 +147,6 @@ def test_a_release_has_its_convention(release: str, convention: str) -> None:
 
 
 # The whole loop around a firmware: pilot → channels → the firmware's rate loop → motors → plant → poses → pilot.
-
-
-CONTRACT = Path(__file__).parents[2] / "agents" / "circle" / "contract.json"
-RATES = rate_map(read_contract(CONTRACT))
-THRUST = ThrustMap(mass=0.6, full_thrust=16.0, reference_voltage=15.0, voltage=15.0)  # the faithful drone's
 
 
 class RecordedRadio(Radio):
@@ -224,16 +179,14 @@ class SitlStep(FirmwareStep):
         return super().send(command)
 
 
-def pilot_on(step: SitlStep, laps: int) -> FlightChain:
-    vehicle = step.plant.vehicle
-    config = ChainConfig(SafetyLimits.of_track(vehicle.track), laps=laps, arm=True)
-    return FlightChain(PilotFlyer(vehicle.track, "faithful"), vehicle.track, config)
+def pilot_on(step: SitlStep) -> FlightChain:
+    return chain_of(step, PilotFlyer(step.plant.vehicle.track, "faithful"), laps=1)
 
 
-@pytest.mark.parametrize("version", ["2026.6", "before"])
+@pytest.mark.parametrize("version", FIRMWARES)
 def test_the_pilot_flies_a_lap_through_the_firmware(version: str) -> None:
     step = SitlStep(version)
-    chain = pilot_on(step, laps=1)
+    chain = pilot_on(step)
     assert step.plant.vehicle.armed is False
     assert step.fly(chain, 50.0, 15.0) == "disarmed: the flight is over"
     assert step.plant.vehicle.gates_passed == step.plant.vehicle.track.num_gates
@@ -247,7 +200,7 @@ def test_the_pilot_flies_a_lap_through_the_firmware(version: str) -> None:
 def test_a_radio_that_is_pulled_out_drops_it_by_the_firmwares_own_failsafe() -> None:
     step = SitlStep("2026.6")
     step.pull_after = 1.5
-    step.fly(pilot_on(step, laps=1), 50.0, 15.0)
+    step.fly(pilot_on(step), 50.0, 15.0)
     assert step.disarmed_at is not None
     assert step.pull_after + FAILSAFE - 0.02 < step.disarmed_at < step.pull_after + FAILSAFE + 0.05
     assert not step.firmware.armed

@@ -9,26 +9,21 @@ import numpy as np
 import pytest
 
 from dreamer_racing.export.onnx_actor import read_contract
-from dreamer_racing.hil.betaflight import Status, check_dump, rate_map, wanted_settings
+from dreamer_racing.hil.betaflight import Status, check_dump, wanted_settings
 from dreamer_racing.hil.betaflight.status import REQUEST
-from dreamer_racing.hil.chain import ChainConfig, FlightChain
 from dreamer_racing.hil.flyer import ActorFlyer
 from dreamer_racing.hil.links import LinkConfig, make_link
 from dreamer_racing.hil.links.link import ChannelLink, TransportLink
 from dreamer_racing.hil.links.msp import MspTelemetry, encode_msp
 from dreamer_racing.hil.links.sitl import SerialOverTcp, SitlTransport, encode_sitl
-from dreamer_racing.hil.safety_limits import SafetyLimits
-from dreamer_racing.hil.sticks import ThrustMap
 from dreamer_racing.hil.vehicle import GRAVITY, Command, Setpoint, at_rest
 from dreamer_racing.plant.betaflight_sitl import CONVENTIONS, convention_of
-from dreamer_racing.plant.firmware_step import FirmwareStep, Radio, SteppedFirmware
+from dreamer_racing.plant.lock_step import FirmwareStep, Radio, SteppedFirmware
 from dreamer_racing.plant.pilot import PilotFlyer
 from dreamer_racing.plant.vehicle import PlantVehicle
-from tests.plant.conftest import CONTRACT
+from tests.plant.conftest import CONTRACT, RATES, THRUST, chain_of
 
 AGENTS = Path(__file__).parents[2] / "agents"
-RATES = rate_map(read_contract(CONTRACT))
-THRUST = ThrustMap(mass=0.6, full_thrust=16.0, reference_voltage=15.0, voltage=15.0)  # the faithful drone's
 LINK_LOST = 0.6  # s, within which motors stop
 SetUp = Callable[..., SteppedFirmware]
 pytestmark = pytest.mark.xdist_group("betaflight")  # which is set up once
@@ -65,11 +60,6 @@ def hover(step: FirmwareStep, rate: float = 100.0) -> None:
     tell(step, asked(thrust=1.1 * GRAVITY), 0.4, rate)
     tell(step, asked(), 0.2, rate)
     assert not step.plant.vehicle.on_stand and np.abs(step.plant.vehicle.pose().body_rates).max() < 0.05
-
-
-def chain_of(step: FirmwareStep, flyer: PilotFlyer | ActorFlyer, laps: int) -> FlightChain:
-    vehicle = step.plant.vehicle
-    return FlightChain(flyer, vehicle.track, ChainConfig(SafetyLimits.of_track(vehicle.track), laps=laps, arm=True))
 
 
 def test_it_is_set_up_as_is_wanted_and_what_it_does_not_know_is_named(set_up: SetUp) -> None:

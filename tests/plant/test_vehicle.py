@@ -27,12 +27,17 @@ def armed(thrust: float, rates: tuple[float, float, float] = (0.0, 0.0, 0.0)) ->
     return Command(True, Setpoint(thrust, np.array(rates)))
 
 
+def tell(vehicle: PlantVehicle, command: Command, seconds: float) -> None:
+    """Give a command, and fly on for so long."""
+    vehicle.command(command)
+    vehicle.advance(seconds)
+
+
 def flying(preset: str = "easy", **differences: float) -> PlantVehicle:
     """A drone that has just left the stand, carrying its weight."""
     mismatch = Mismatch(**differences)
     vehicle = PlantVehicle("circle", preset, mismatch)
-    vehicle.command(armed(GRAVITY * mismatch.mass / mismatch.thrust))
-    vehicle.advance(10 * MOTOR_LAG)
+    tell(vehicle, armed(GRAVITY * mismatch.mass / mismatch.thrust), 10 * MOTOR_LAG)
     assert not vehicle.on_stand
     return vehicle
 
@@ -40,8 +45,7 @@ def flying(preset: str = "easy", **differences: float) -> PlantVehicle:
 @pytest.mark.parametrize("preset", ["easy", "faithful"])
 def test_hover_stays_where_the_stand_was(preset: str) -> None:
     vehicle = PlantVehicle("circle", preset)
-    vehicle.command(Command(True, hover()))
-    vehicle.advance(4.0)
+    tell(vehicle, Command(True, hover()), 4.0)
     pose = vehicle.pose()
     assert not vehicle.on_stand and vehicle.crash is CrashCause.NONE
     assert pose.time == pytest.approx(4.0) and pose.position == pytest.approx(START, abs=0.02)
@@ -59,8 +63,7 @@ def test_hover_stays_where_the_stand_was(preset: str) -> None:
 )
 def test_the_stand_holds_until_it_is_armed_and_asked_for_half_of_its_weight(command: Command, held: bool) -> None:
     vehicle = PlantVehicle("circle", "faithful")
-    vehicle.command(command)
-    vehicle.advance(SPUN_UP - 0.003)
+    tell(vehicle, command, SPUN_UP - 0.003)
     assert vehicle.on_stand and vehicle.pose().position == pytest.approx(START)
     assert vehicle.specific_force == pytest.approx((0.0, 0.0, GRAVITY))
     vehicle.advance(0.006)
@@ -70,11 +73,9 @@ def test_the_stand_holds_until_it_is_armed_and_asked_for_half_of_its_weight(comm
 @pytest.mark.parametrize(("rates", "sinks"), [((0.0, 0.0, 0.0), False), ((0.0, 1.0, 0.0), True)])
 def test_the_stand_bears_what_does_not_bear_itself_until_it_slides_off(rates: tuple[float, ...], sinks: bool) -> None:
     vehicle = PlantVehicle("circle")
-    vehicle.command(armed(0.8 * GRAVITY))
-    vehicle.advance(0.3)
+    tell(vehicle, armed(0.8 * GRAVITY), 0.3)
     assert not vehicle.on_stand
-    vehicle.command(Command(True, Setpoint(0.8 * GRAVITY, np.array(rates))))
-    vehicle.advance(0.8)
+    tell(vehicle, Command(True, Setpoint(0.8 * GRAVITY, np.array(rates))), 0.8)
     pose = vehicle.pose()
     assert bool(pose.position[2] < START[2] - 0.05) is sinks
     if not sinks:
@@ -84,10 +85,8 @@ def test_the_stand_bears_what_does_not_bear_itself_until_it_slides_off(rates: tu
 def test_a_moment_of_thrust_is_not_enough_to_leave_the_stand() -> None:
     vehicle = PlantVehicle("circle")
     for _ in range(5):
-        vehicle.command(armed(GRAVITY))
-        vehicle.advance(0.1)
-        vehicle.command(armed(0.0))
-        vehicle.advance(0.1)
+        tell(vehicle, armed(GRAVITY), 0.1)
+        tell(vehicle, armed(0.0), 0.1)
     assert vehicle.on_stand
 
 
@@ -114,26 +113,22 @@ def test_a_body_rate_step_reaches_its_rate(axis: int, rate: float, thrust: float
     vehicle = flying("faithful", thrust=thrust)
     rates = [0.0, 0.0, 0.0]
     rates[axis] = rate
-    vehicle.command(armed(GRAVITY / thrust, tuple(rates)))
-    vehicle.advance(0.4)
+    tell(vehicle, armed(GRAVITY / thrust, tuple(rates)), 0.4)
     assert vehicle.pose().body_rates == pytest.approx(rates, abs=0.03 * abs(rate))
 
 
 def test_body_rates_are_clipped_to_what_the_flight_controller_is_set_to() -> None:
     vehicle = flying()
-    vehicle.command(armed(GRAVITY, (0.0, 0.0, 50.0)))
-    vehicle.advance(0.5)
+    tell(vehicle, armed(GRAVITY, (0.0, 0.0, 50.0)), 0.5)
     assert vehicle.pose().body_rates[2] == pytest.approx(4.0, rel=0.03)
 
 
 @pytest.mark.parametrize(("mass", "thrust"), [(1.0, 1.0), (1.3, 1.0), (1.0, 0.8), (1.2, 0.9)])
 def test_acceleration_goes_with_thrust_and_against_mass(mass: float, thrust: float) -> None:
     vehicle = flying(mass=mass, thrust=thrust)
-    vehicle.command(armed(14.0))
-    vehicle.advance(0.4)
+    tell(vehicle, armed(14.0), 0.4)
     assert vehicle.specific_force == pytest.approx((0.0, 0.0, 14.0 * thrust / mass), rel=1e-3, abs=1e-6)
-    vehicle.command(armed(40.0))
-    vehicle.advance(0.3)
+    tell(vehicle, armed(40.0), 0.3)
     assert vehicle.specific_force[2] == pytest.approx(4 * 4.0 * thrust / (0.6 * mass), rel=1e-3)  # four full rotors
 
 
@@ -151,8 +146,7 @@ def test_drag_is_in_proportion_to_speed(drag: float) -> None:
 def test_rotors_follow_with_their_lag(lag: float) -> None:
     vehicle = flying(motor_lag=lag)
     vehicle.advance(0.3)
-    vehicle.command(armed(16.0))
-    vehicle.advance(lag)
+    tell(vehicle, armed(16.0), lag)
     before, after = math.sqrt(GRAVITY), math.sqrt(16.0)
     speed = after + (before - after) * math.exp(-1.0)
     assert vehicle.specific_force[2] == pytest.approx(speed**2, rel=0.02)
@@ -173,11 +167,9 @@ def test_a_command_acts_after_its_delay(delay: float) -> None:
 
 def test_disarming_is_delayed_like_any_command_and_a_cut_is_not() -> None:
     vehicle = flying("faithful", delay=0.05)
-    vehicle.command(at_rest())
-    vehicle.advance(0.049)
+    tell(vehicle, at_rest(), 0.049)
     assert vehicle.armed
-    vehicle.command(armed(GRAVITY))
-    vehicle.advance(0.002)
+    tell(vehicle, armed(GRAVITY), 0.002)
     assert not vehicle.armed
     vehicle.advance(0.05)
     assert vehicle.armed
@@ -191,8 +183,7 @@ def test_disarming_is_delayed_like_any_command_and_a_cut_is_not() -> None:
 def test_it_flies_as_the_simulator_in_which_policies_learn(preset: str) -> None:
     parameters = without_randomisation(PRESETS[preset])
     vehicle = PlantVehicle("circle", preset)
-    vehicle.command(Command(True, hover()))
-    vehicle.advance(0.4)
+    tell(vehicle, Command(True, hover()), 0.4)
     before = vehicle.pose()
     simulator = MujocoSimulator(load_track("circle"), parameters, 1, renderer=None)
     place = (torch.tensor(values).unsqueeze(0) for values in before[1:4])
@@ -201,8 +192,7 @@ def test_it_flies_as_the_simulator_in_which_policies_learn(preset: str) -> None:
     actions[:, 0] -= 0.1
     for action in actions:
         thrust = parameters.collective_thrust_scale * (1.0 + action[0])
-        vehicle.command(armed(thrust, tuple(action[1:] * parameters.body_rate_max)))
-        vehicle.advance(parameters.control_dt)
+        tell(vehicle, armed(thrust, tuple(action[1:] * parameters.body_rate_max)), parameters.control_dt)
         simulator.step(torch.tensor(action).unsqueeze(0))
     assert vehicle.crash is CrashCause.NONE and np.linalg.norm(vehicle.pose().position - START) > 0.5
     assert vehicle.pose().position == pytest.approx(simulator.state.position[0].numpy(), abs=2e-3)
@@ -211,8 +201,7 @@ def test_it_flies_as_the_simulator_in_which_policies_learn(preset: str) -> None:
 
 def test_a_crash_ends_it_until_it_is_put_back() -> None:
     vehicle = flying()
-    vehicle.command(armed(20.0))
-    vehicle.advance(2.0)
+    tell(vehicle, armed(20.0), 2.0)
     assert vehicle.crash is CrashCause.OUT_OF_BOUNDS and vehicle.crash_description.startswith("out of bounds at ")
     vehicle.advance(2.5)
     assert vehicle.pose().position == pytest.approx((4.0, -2.5, 0.05), abs=1e-6)
@@ -222,8 +211,7 @@ def test_a_crash_ends_it_until_it_is_put_back() -> None:
     assert vehicle.on_stand and not vehicle.armed
     assert vehicle.crash is CrashCause.NONE and vehicle.crash_description == "none"
     assert vehicle.pose().position == pytest.approx(START) and vehicle.time == time
-    vehicle.command(armed(GRAVITY))
-    vehicle.advance(1.0)
+    tell(vehicle, armed(GRAVITY), 1.0)
     assert not vehicle.on_stand and vehicle.pose().position == pytest.approx(START, abs=0.01)
 
 
@@ -263,15 +251,13 @@ def test_a_betaflight_follows_rates_late_and_with_overshoot() -> None:
 
 def test_a_betaflight_that_is_armed_again_has_forgotten_the_flight_before() -> None:
     first, again = PlantVehicle("circle", "betaflight"), PlantVehicle("circle", "betaflight")
-    again.command(armed(15.0, (3.0, -2.0, 1.0)))
-    again.advance(0.5)
+    tell(again, armed(15.0, (3.0, -2.0, 1.0)), 0.5)
     again.cut()
     again.advance(2.0)
     again.reset()
     ends = []
     for vehicle in (first, again):
-        vehicle.command(armed(12.0, (1.0, 0.0, 0.0)))
-        vehicle.advance(0.6)
+        tell(vehicle, armed(12.0, (1.0, 0.0, 0.0)), 0.6)
         ends.append(vehicle.pose())
     assert ends[0].body_rates == pytest.approx(ends[1].body_rates) and ends[0].position == pytest.approx(
         ends[1].position
@@ -283,6 +269,7 @@ def test_a_betaflight_that_is_armed_again_has_forgotten_the_flight_before() -> N
     [((2, 3), 0, 1), ((0, 2), 1, 1), ((1, 2), 2, -1)],  # left: rolls right; rear: nose down; front right: yaws right
 )
 def test_rotors_turn_the_body_as_betaflight_means_them_to(stronger: tuple[int, int], axis: int, sign: int) -> None:
+    """As measured: so the firmware answers sticks while its body is clamped."""
     vehicle = flying()
     motors = np.full(4, 0.55)
     motors[list(stronger)] = 0.65
