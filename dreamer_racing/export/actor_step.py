@@ -1,9 +1,7 @@
 """Export of the recurrent actor as one step with explicit state, published only if all copies match the original.
 
 The step is ``(observation, h, z, previous_action, is_init[, imu][, noise]) -> (action, h_next, z_next)``, batch size 1.
-It can also be written in two `PARTS`: ``advance``, ``(h, z, previous_action, is_init) -> h_next``, needs no
-observation, so that a vehicle can run it between control steps; ``act``, ``(observation, h_next[, imu][, noise]) ->
-(action, z_next)``, is then the only computation between an observation and its action.
+Of its two `PARTS`, ``advance`` needs no observation, so that a vehicle can run it between control steps.
 
 Shape legend: D belief, S state = L·K, L latents, K classes, A action, V vector entries.
 """
@@ -59,6 +57,8 @@ class ActorStep(nn.Module):
     """
 
     latent = "mode"
+    noise_shape: tuple[int, int] | None = None
+    """Shape (L, K) of the input ``noise``; None without noise."""
 
     def __init__(self, agent: Agent) -> None:
         super().__init__()
@@ -70,11 +70,6 @@ class ActorStep(nn.Module):
             # torch.export cannot save channels-last weights.
             parameter.data = parameter.data.cpu().contiguous()
         self.requires_grad_(False)
-
-    @property
-    def noise_shape(self) -> tuple[int, int] | None:
-        """Shape (L, K) of the input ``noise``; None without noise."""
-        return None
 
     def forward(
         self, observation: Tensor, h: Tensor, z: Tensor, previous_action: Tensor, is_init: Tensor, *more: Tensor
@@ -135,10 +130,9 @@ class SampledActorStep(ActorStep):
 
     latent = "sample"
 
-    @property
-    def noise_shape(self) -> tuple[int, int] | None:
-        """Shape (L, K) of the noise of one step."""
-        return self.size.latents, self.size.classes
+    def __init__(self, agent: Agent) -> None:
+        super().__init__(agent)
+        self.noise_shape = self.size.latents, self.size.classes
 
     def act(self, observation: Tensor, h: Tensor, *more: Tensor) -> tuple[Tensor, Tensor]:
         """Return action and next state as `ActorStep.act`; the last argument is the noise ``(1, L, K)`` in [0, 1)."""

@@ -1,8 +1,6 @@
 """Loading of agents for flight, from a run's checkpoint or from an agent folder.
 
-An agent folder holds `FILES`: the exported actor with its contract, the weights for ONNX and torch, the configuration
-of the run, and agent.json with the agent's origin and results. It lacks the critic, heads, decoders, optimiser and
-replay buffer.
+An agent folder holds `FILES` (docs/agents.md), and no critic, heads, decoders, optimiser or replay buffer.
 """
 
 from __future__ import annotations
@@ -293,7 +291,6 @@ def read_evaluation(
 
 def _size(saved: dict[str, Any]) -> ModelSize:
     """Build a model size from its saved form, with lists as tuples; other entries are ignored."""
-    names = {field.name for field in fields(ModelSize)}
-    known = {name: value for name, value in saved.items() if name in names}
+    known = {field.name: saved[field.name] for field in fields(ModelSize) if field.name in saved}
     size: dict[str, Any] = {name: tuple(value) if isinstance(value, list) else value for name, value in known.items()}
     return ModelSize(**size)

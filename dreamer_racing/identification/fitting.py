@@ -239,19 +239,16 @@ def fit(recorded: Recorded, nominal: QuadrotorParameters) -> Fit:
 
 
 def _solve(
-    error: Tensor, floor: Tensor, probes: Tensor, priors: Tensor, found: Tensor
+    error: Tensor,  # (T, C, S, 3) of the present parameters, and with each one probed
+    floor: Tensor,  # (3,) rad/s, least assumed error: in a hover, errors are close to zero
+    probes: Tensor,  # (P,) finite-difference steps
+    priors: Tensor,  # (P,) standard deviations of the priors
+    found: Tensor,  # (P,) present parameters
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Return the change of the parameters, and two standard deviations of them, (P,) each.
 
     The first deviation is that of the posterior, the second that of the estimate over stretches (sandwich), which also
     holds if errors are not independent.
-
-    Args:
-        error: (T, C, S, 3) of the present parameters, and with each one probed.
-        floor: (3,) rad/s, least assumed error: in a hover, errors are close to zero.
-        probes: (P,) finite-difference steps.
-        priors: (P,) standard deviations of the priors.
-        found: (P,) present parameters.
     """
     present = error[:, 0]  # (T, S, 3)
     slopes = (error[:, 1:] - present.unsqueeze(1)) / probes.view(-1, 1, 1)  # (T, P, S, 3)
