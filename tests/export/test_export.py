@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 import functools
+import itertools
 import json
 import math
 import shutil
@@ -12,11 +13,13 @@ import sys
 import zipfile
 from collections.abc import Callable
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 import pytest
 import torch
 from omegaconf import OmegaConf
+from torch import Tensor
 
 from dreamer_racing.envs.drone.parameters import PRESETS
 from dreamer_racing.envs.simulator.scene import Camera
@@ -26,17 +29,16 @@ from dreamer_racing.export.actor_step import ActorStep, SampledActorStep, check_
 from dreamer_racing.export.contract import hash_weights, make_contract
 from dreamer_racing.export.parity import MIN_STEPS, ParityError, RecordedFlight, TorchActor, check_parity
 from dreamer_racing.export.shipped_agent import load_agent
-from dreamer_racing.modules import Interface, ModelSize, get_size
+from dreamer_racing.modules import Interface, ModelSize
 from dreamer_racing.modules.agent import Agent
 from dreamer_racing.modules.rssm import mix_uniform
-from tests.export.recorded import answered
-from tests.running_recipes import UNDRAWN, recipe, recipe_module
+from tests.export.recorded import make_agent, make_flight
+from tests.running_recipes import ROOT, UNDRAWN, completed, recipe
 
 pytest.importorskip("onnxscript")
 pytest.importorskip("onnxruntime")
 pytestmark = pytest.mark.xdist_group("export")  # one worker makes what these tests share
 
-ROOT = Path(__file__).parents[2]
 REFERENCE = ModelSize("tiny", belief=16, hidden=8, classes=4, units=8, cnn_depth=2, latents=4, blocks=4)
 """The 2025 architecture: block GRU, RMS norm, max-pool."""
 LEARNED = ModelSize("tiny_learned", belief=16, hidden=8, classes=4, units=8, cnn_depth=2, latents=4,
@@ -44,33 +46,8 @@ LEARNED = ModelSize("tiny_learned", belief=16, hidden=8, classes=4, units=8, cnn
 """The 2023 architecture: dense GRU, layer norm, a learned initial state."""
 
 
-def make_agent(size: ModelSize | str = "debug", interface: Interface | None = None, seed: int = 0) -> Agent:
-    """An agent of random weights, all of which matter: an untrained actor's last layer is nearly zero."""
-    with torch.random.fork_rng(devices=[]):
-        torch.manual_seed(seed)
-        agent = Agent(get_size(size), interface or Interface(), decode=False)
-        with torch.no_grad():
-            for parameter in agent.actor.mlp.parameters():
-                parameter.add_(0.3 * torch.randn_like(parameter))
-            agent.world_model.rssm.initial_belief.add_(torch.randn_like(agent.world_model.rssm.initial_belief))
-    return agent.requires_grad_(False)
-
-
 def contract_of(step: ActorStep) -> dict:
     return make_contract(step, PRESETS["easy"], Camera(), checkpoint="checkpoint-1", track="circle", preset="easy")
-
-
-@functools.cache
-def make_flight(agent: Agent, steps: int = MIN_STEPS) -> RecordedFlight:
-    """Random observations, with a reset in every 40 steps and two next to each other, and the policy's answers."""
-    random = np.random.default_rng(0)
-    if agent.interface.pixels:
-        observations = random.integers(0, 256, (steps, 64, 64, 3), np.uint8)
-    else:
-        observations = random.normal(size=(steps, agent.interface.vector_dim)).astype(np.float32)
-    is_init = np.arange(steps) % 40 == 0
-    is_init[121] = True
-    return answered(agent, observations, is_init)
 
 
 @pytest.fixture(scope="module")
@@ -78,23 +55,45 @@ def agent() -> Agent:
     return make_agent()
 
 
+class Exported(NamedTuple):
+    """An export, the flight that it was compared on, and the largest deviation of each copy."""
+
+    path: Path
+    flight: RecordedFlight
+    deviation: dict[str, float]
+
+
+NUMBERS = Interface(pixels=False, vector_dim=21)
+KINDS: dict[str, tuple[dict, str, dict]] = {
+    "mode": ({}, "mode", {}),
+    "sample": ({}, "sample", {}),
+    "numbers": ({"interface": NUMBERS}, "mode", {}),
+    "block": ({"size": REFERENCE}, "sample", {}),
+    "block in parts": ({"size": REFERENCE}, "mode", {"parts": True, "shared_weights": True}),
+    "learned": ({"size": LEARNED}, "mode", {}),
+    "learned in parts": ({"size": LEARNED}, "sample", {"parts": True}),
+}
+"""Exports: of which agent, in which latent mode, with which options."""
+
+
 @pytest.fixture(scope="module")
-def exports(tmp_path_factory: pytest.TempPathFactory, agent: Agent) -> Callable[[str], Path]:
-    """Exports the agent in a latent mode, once."""
+def exports(tmp_path_factory: pytest.TempPathFactory) -> Callable[[str], Exported]:
+    """Exports one of `KINDS`, once."""
 
     @functools.cache
-    def export_once(latent: str) -> Path:
-        output, step = tmp_path_factory.mktemp(latent) / "actor.onnx", make_step(agent, latent)
-        export_actor(step, contract_of(step), make_flight(agent), output)
-        return output
+    def export_once(kind: str) -> Exported:
+        of_agent, latent, options = KINDS[kind]
+        output, agent = tmp_path_factory.mktemp("export") / "actor.onnx", make_agent(**of_agent)
+        step, flight = make_step(agent, latent), make_flight(agent)
+        return Exported(output, flight, export_actor(step, contract_of(step), flight, output, **options))
 
     return export_once
 
 
 @pytest.fixture(scope="module", params=["mode", "sample"])
-def exported(request: pytest.FixtureRequest, exports: Callable[[str], Path]) -> Path:
+def exported(request: pytest.FixtureRequest, exports: Callable[[str], Exported]) -> Path:
     """The .onnx file of an export of either latent mode."""
-    return exports(request.param)
+    return exports(request.param).path
 
 
 # --- the step ---------------------------------------------------------------------------------------------------------
@@ -137,21 +136,15 @@ def test_noise_of_zero_is_no_accident(agent: Agent) -> None:
 # --- the copies -------------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(
-    ("size", "interface", "latent"),
-    [
-        (REFERENCE, Interface(), "sample"),
-        (LEARNED, Interface(), "mode"),  # and by samples in parts, below
-        ("debug", Interface(pixels=False, vector_dim=21), "mode"),  # and images in both, above
-    ],
-    ids=["block-sample", "learned-mode", "vector-mode"],
-)
-def test_every_architecture_flies_alike(size, interface: Interface, latent: str, tmp_path: Path) -> None:
-    agent = make_agent(size, interface)
-    step, flight = make_step(agent, latent), make_flight(agent)
-    deviation = export_actor(step, contract_of(step), flight, tmp_path / "actor.onnx")
-    assert deviation.keys() == {"onnxruntime", "torch.export"} and max(deviation.values()) < 1e-5
-    assert {path.name for path in tmp_path.iterdir()} == {"actor.onnx", "actor.pt2", "contract.json"}
+@pytest.mark.parametrize("kind", KINDS)
+def test_every_architecture_flies_alike(kind: str, exports: Callable[[str], Exported]) -> None:
+    options, (output, _, deviation) = KINDS[kind][-1], exports(kind)
+    copies, files = {"onnxruntime", "torch.export"}, {"actor.onnx", "contract.json"}
+    files |= {"weights.safetensors" if "shared_weights" in options else "actor.pt2"}
+    if "parts" in options:
+        copies, files = copies | {"onnxruntime in parts"}, files | {"actor_advance.onnx", "actor_act.onnx"}
+    assert deviation.keys() == copies and max(deviation.values()) < 1e-5
+    assert {path.name for path in output.parent.iterdir()} == files
 
 
 def test_what_flies_otherwise_than_the_policy_did_is_refused(agent: Agent, tmp_path: Path) -> None:
@@ -173,49 +166,23 @@ def copies(onnx: Path, program: Path) -> Callable[[ActorStep, Path, Path], None]
 
 
 def test_an_export_of_another_kind_leaves_nothing_of_an_earlier_one(agent, exports, tmp_path, monkeypatch) -> None:
-    step, flight, earlier = make_step(agent, "mode"), make_flight(agent), exports("mode")
-    other = tmp_path / "weights.safetensors"  # where no export has been
-    other.write_text("mine", encoding="utf-8")
-    with monkeypatch.context() as patch:
-        patch.setattr(export, "write_step", copies(earlier, earlier.with_suffix(".pt2")))
-        export_actor(step, contract_of(step), flight, tmp_path / "actor.onnx")
-    assert other.read_text(encoding="utf-8") == "mine"
-    other.unlink()
-    export_actor(step, contract_of(step), flight, tmp_path / "actor.onnx", shared_weights=True)
-    assert {path.name for path in tmp_path.iterdir()} == {"actor.onnx", "contract.json", "weights.safetensors"}
+    step, (whole, flight, _) = make_step(agent, "mode"), exports("mode")
+    monkeypatch.setattr(export, "write_step", copies(whole, whole.with_suffix(".pt2")))
+    shutil.copytree(exports("block in parts").path.parent, tmp_path / "old")
+    (tmp_path / "old" / "actor_act.onnx").unlink()  # gone already
+    (tmp_path / "new").mkdir()
+    (tmp_path / "new" / "weights.safetensors").write_text("mine")  # where no export has been
+    files = {"actor.onnx", "actor.pt2", "contract.json"}
+    for folder, expected in (("old", files), ("new", files | {"weights.safetensors"})):
+        export_actor(step, contract_of(step), flight, tmp_path / folder / "actor.onnx")
+        assert {path.name for path in (tmp_path / folder).iterdir()} == expected
+    assert (tmp_path / "new" / "weights.safetensors").read_text() == "mine"
 
 
-InParts = tuple[Path, RecordedFlight, dict[str, float]]
-"""The .onnx file of a step in two parts, the flight on which it was compared, and its deviation."""
-IN_PARTS = {"gru": (LEARNED, "sample", False), "block": (REFERENCE, "mode", True)}
-"""Size, latent mode and whether the files share weights."""
-
-
-@pytest.fixture(scope="module")
-def in_parts(tmp_path_factory: pytest.TempPathFactory) -> Callable[[str], InParts]:
-    """Exports one of `IN_PARTS`, once."""
-
-    @functools.cache
-    def export_once(kind: str) -> InParts:
-        size, latent, shared_weights = IN_PARTS[kind]
-        agent, output = make_agent(size), tmp_path_factory.mktemp("parts") / "actor.onnx"
-        step, flight = make_step(agent, latent), make_flight(agent)
-        contract = contract_of(step)
-        deviation = export_actor(step, contract, flight, output, shared_weights=shared_weights, parts=True)
-        return output, flight, deviation
-
-    return export_once
-
-
-@pytest.mark.parametrize("kind", IN_PARTS)
-def test_a_step_in_two_parts_is_the_whole_one(kind: str, in_parts: Callable[[str], InParts]) -> None:
+@pytest.mark.parametrize("kind", ["learned in parts", "block in parts"])
+def test_a_step_in_two_parts_is_the_whole_one(kind: str, exports: Callable[[str], Exported]) -> None:
     """Whether its first part is run ahead of time, and whether that is in vain because the flight begins anew."""
-    output, flight, deviation = in_parts(kind)
-    assert max(deviation.values()) < 1e-5 and {"onnxruntime", "onnxruntime in parts"} <= deviation.keys()
-    kept = {"weights.safetensors"} if IN_PARTS[kind][-1] else {"actor.pt2"}
-    files = {"actor.onnx", "actor_advance.onnx", "actor_act.onnx", "contract.json"}
-    assert {path.name for path in output.parent.iterdir()} == files | kept
-
+    output, flight, _ = exports(kind)
     ahead, late, whole = (onnx_actor.OnnxActor(output, seed=3, whole=each) for each in (False, False, True))
     assert (ahead.in_parts, whole.in_parts) == (True, False)
     for image, is_init in zip(flight.observations, flight.is_init, strict=True):
@@ -229,8 +196,8 @@ def test_a_step_in_two_parts_is_the_whole_one(kind: str, in_parts: Callable[[str
         whole.prepare()  # nothing
 
 
-def test_parts_of_another_export_are_refused(in_parts, agent, exports, tmp_path: Path, monkeypatch) -> None:
-    shutil.copytree(in_parts("block")[0].parent, tmp_path, dirs_exist_ok=True)  # with shared weights
+def test_parts_of_another_export_are_refused(exports: Callable[[str], Exported], tmp_path: Path) -> None:
+    shutil.copytree(exports("block in parts").path.parent, tmp_path, dirs_exist_ok=True)
     output = tmp_path / "actor.onnx"
     contract = json.loads((tmp_path / "contract.json").read_text())
     files = contract["files"]
@@ -241,10 +208,6 @@ def test_parts_of_another_export_are_refused(in_parts, agent, exports, tmp_path:
     (tmp_path / "actor_act.onnx").unlink()
     with pytest.raises(FileNotFoundError, match="actor_act.onnx: it belongs beside actor.onnx"):
         onnx_actor.OnnxActor(output)
-    step, whole = ActorStep(agent), exports("mode")
-    monkeypatch.setattr(export, "write_step", copies(whole, whole.with_suffix(".pt2")))
-    export_actor(step, contract_of(step), make_flight(agent), output)
-    assert {path.name for path in tmp_path.iterdir()} == {"actor.onnx", "actor.pt2", "contract.json"}, "what is left?"
 
 
 def test_the_flight_side_flies_as_torch_does(exported: Path, agent: Agent) -> None:
@@ -303,45 +266,36 @@ def altered(agent: Agent, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.mark.parametrize(("kind", "name"), [("onnx", "onnxruntime"), ("program", "torch.export")])
 def test_an_altered_weight_is_refused(kind: str, name: str, agent, altered, exports, tmp_path, monkeypatch) -> None:
-    files = {"onnx": exports("mode"), "program": exports("mode").with_suffix(".pt2")}
-    shutil.copytree(exports("mode").parent, tmp_path, dirs_exist_ok=True)
-    step = ActorStep(agent)
-    output = tmp_path / "actor.onnx"
+    step, (earlier, flight, _), output = ActorStep(agent), exports("mode"), tmp_path / "actor.onnx"
+    files = {"onnx": earlier, "program": earlier.with_suffix(".pt2")}
+    shutil.copytree(earlier.parent, tmp_path, dirs_exist_ok=True)
     before = {path.name: path.read_bytes() for path in tmp_path.iterdir()}
     files[kind] = altered / files[kind].name
     monkeypatch.setattr(export, "write_step", copies(**files))
     with pytest.raises(ParityError, match=rf"^{name} does not match torch: at step \d+ of 200 .* deviates by \d"):
-        export_actor(step, contract_of(step), make_flight(agent), output)
+        export_actor(step, contract_of(step), flight, output)
     assert {path.name: path.read_bytes() for path in tmp_path.iterdir()} == before, "the earlier export stays"
     with pytest.raises(ParityError):
-        export_actor(step, contract_of(step), make_flight(agent), tmp_path / "new" / "actor.onnx")
+        export_actor(step, contract_of(step), flight, tmp_path / "new" / "actor.onnx")
     assert not list((tmp_path / "new").iterdir())
 
 
-class Disturbed(TorchActor):
-    """Changes the outputs of the flight's last step, where no later step can show it."""
+def check_disturbed(agent: Agent, change: Callable[[list[Tensor]], object], latent: str = "mode") -> float:
+    """Change the outputs of the flight's last step in a copy, where no later step can show it."""
+    step, calls = make_step(agent, latent), itertools.count(1)
 
-    def __init__(self, contract: dict, step: ActorStep, change: Callable[[list[np.ndarray]], None]) -> None:
-        super().__init__(contract, step)
-        self.change, self.steps = change, 0
-
-    def _run(self, feed):
-        self.steps += 1
-        outputs = [value.copy() for value in super()._run(feed)]
-        if self.steps == MIN_STEPS:
-            self.change(outputs)
+    def disturbed(*inputs: Tensor) -> list[Tensor]:
+        outputs = [output.clone() for output in step(*inputs)]
+        if next(calls) == MIN_STEPS:
+            change(outputs)
         return outputs
 
-
-def check_disturbed(agent: Agent, change: Callable[[list[np.ndarray]], None]) -> float:
-    step = ActorStep(agent)
-    contract = contract_of(step)
-    actors = {"torch": TorchActor(contract, step), "copy": Disturbed(contract, step, change)}
+    actors = {name: TorchActor(contract_of(step), fly) for name, fly in (("torch", step), ("copy", disturbed))}
     return check_parity(actors, make_flight(agent))["copy"]
 
 
-def add_to_action(value: float) -> Callable[[list[np.ndarray]], None]:
-    return lambda outputs: np.add.at(outputs[0], (0, 1), value)
+def add_to_action(value: float) -> Callable[[list[Tensor]], object]:
+    return lambda outputs: outputs[0][0, 1].add_(value)
 
 
 def test_the_tolerance_of_actions(agent: Agent) -> None:
@@ -351,12 +305,14 @@ def test_the_tolerance_of_actions(agent: Agent) -> None:
             check_disturbed(agent, add_to_action(value))
 
 
-def test_a_flipped_latent_is_refused_even_if_no_action_shows_it(agent: Agent) -> None:
-    def next_class(outputs: list[np.ndarray]) -> None:
-        outputs[2] = np.roll(outputs[2].reshape(4, 4), 1, axis=1).reshape(1, 16)
+@pytest.mark.parametrize(("latent", "end"), [("mode", "written.$"), ("sample", "try another seed.$")])  # bad luck
+def test_a_flipped_latent_is_refused_even_if_no_action_shows_it(latent: str, end: str, agent: Agent) -> None:
+    def next_class(outputs: list[Tensor]) -> None:
+        outputs[2] = outputs[2].view(4, 4).roll(1, dims=1).view(1, 16)
 
-    with pytest.raises(ParityError, match=r"step 199 of 200.*by 0.00e\+00.*latent 0 by 1.00e\+00 \(allowed: 1e-03\)"):
-        check_disturbed(agent, next_class)
+    deviates = rf"step 199 of 200.*by 0.00e\+00.*latent 0 by 1.00e\+00 \(allowed: 1e-03\).*{end}"
+    with pytest.raises(ParityError, match=deviates):
+        check_disturbed(agent, next_class, latent)
 
 
 # --- the contract -----------------------------------------------------------------------------------------------------
@@ -385,7 +341,7 @@ def test_the_contract_says_what_a_pilot_must_know(exported: Path, agent: Agent) 
 
 
 def test_the_contract_of_an_agent_that_sees_numbers_lists_them() -> None:
-    contract = contract_of(ActorStep(make_agent(interface=Interface(pixels=False, vector_dim=21))))
+    contract = contract_of(ActorStep(make_agent(interface=NUMBERS)))
     assert contract["camera"] is None
     channels = contract["vector"]["channels"]
     assert len(channels) == 21
@@ -479,7 +435,7 @@ def test_a_wrong_image_is_refused_and_changes_nothing(exported: Path, observatio
 def test_noise_and_numbers_are_checked_too(exported: Path) -> None:
     with pytest.raises(ValueError, match="noise"):
         onnx_actor.OnnxActor(exported).step(np.zeros((64, 64, 3), np.uint8), np.zeros((3, 3), np.float32))
-    step = ActorStep(make_agent(interface=Interface(pixels=False, vector_dim=21)))
+    step = ActorStep(make_agent(interface=NUMBERS))
     with pytest.raises(ValueError, match="vector: .* not finite"):
         TorchActor(contract_of(step), step).step(np.full(21, np.nan, np.float32))
 
@@ -576,19 +532,17 @@ def test_bad_arguments_are_refused(agent: Agent, tmp_path: Path, monkeypatch: py
 def run_dir(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A finished debug run on small images, of a loss that has no image decoder."""
     directory = tmp_path_factory.mktemp("runs") / "first run"
-    done = recipe(
+    completed(
         "dreamer_v3", "track=circle", "model=debug", "loss=privileged", "env.preset=faithful", "env.camera_tilt=30",
         "env.image_size=32", "env.control_rate=40", "model.state_std=false",
         "env.num_envs=4", "prefill=100", "total_env_steps=160", "replay.capacity=1000", "evaluation.every=0",
         f"run_dir='{directory}'", cwd=directory.parent, before=UNDRAWN,
     )  # fmt: skip
-    assert done.returncode == 0, done.stderr
     return directory
 
 
 def test_the_recipe_exports_a_run(run_dir: Path) -> None:
-    done = recipe("export", f"checkpoint='{run_dir}'", cwd=run_dir.parent)
-    assert done.returncode == 0, done.stderr
+    done = completed("export", f"checkpoint='{run_dir}'", cwd=run_dir.parent)
     assert "Warning" not in done.stderr
     folder = run_dir / "export"
     assert {path.name for path in folder.iterdir()} == {"actor.onnx", "actor.pt2", "contract.json"}
@@ -607,38 +561,11 @@ def test_the_recipe_exports_a_run(run_dir: Path) -> None:
 
 
 def test_the_recipe_refuses_a_copy_that_flies_differently(run_dir: Path) -> None:
-    altered = (
-        "import dreamer_racing.export.actor_step as export, copy\n"
-        "write = export.write_step\n"
-        "def altered(step, onnx, program):\n"
-        "    step = copy.deepcopy(step)\n"
-        "    next(step.rssm.cell.parameters()).add_(5.0)\n"
-        "    write(step, onnx, program)\n"
-        "export.write_step = altered\n"
-    )
+    strict = "from dreamer_racing.export import parity\nparity.ACTION_TOLERANCE = -1.0\n"
     output = run_dir.parent / "refused" / "actor.onnx"
     done = recipe(
-        "export", f"checkpoint='{run_dir}'", f"output='{output}'", "latent=sample", cwd=run_dir.parent, before=altered
+        "export", f"checkpoint='{run_dir}'", f"output='{output}'", "latent=sample", cwd=run_dir.parent, before=strict
     )
     assert done.returncode == 1, done.stderr
     assert "error: onnxruntime does not match torch: at step" in done.stderr and "Traceback" not in done.stderr
-    assert "try another seed" in done.stderr, "a sample can be bad luck"
     assert not list(output.parent.iterdir())
-
-
-@pytest.mark.parametrize(
-    ("settings", "words"),
-    [
-        ({"checkpoint": "/nowhere"}, ["/nowhere", "does not exist"]),
-        ({"output": "/dev/null/x/actor.onnx"}, ["/dev/null/x", "cannot write"]),
-        ({"steps": 10}, ["steps=10", "200"]),
-    ],
-    ids=["checkpoint", "output", "steps"],
-)
-def test_bad_input_gets_a_plain_error(run_dir: Path, settings: dict, words: list[str], capsys) -> None:
-    exporting = recipe_module("export")
-    with pytest.raises(SystemExit) as refused, recipe_module("composing.entry").plain_errors():
-        exporting.export(exporting.ExportConfig(**{"checkpoint": str(run_dir), **settings}))
-    said = capsys.readouterr().err
-    assert refused.value.code == 2 and all(word in said for word in words), said
-    assert len(said.strip().splitlines()) <= 6

@@ -20,8 +20,8 @@ from dreamer_racing.export.parity import MIN_STEPS, RecordedFlight, TorchActor, 
 from dreamer_racing.export.weights_file import read_weights, write_weights
 from dreamer_racing.hil.camera import camera_of
 from dreamer_racing.hil.flyer import ActorFlyer
-from dreamer_racing.modules import Interface, get_size
-from dreamer_racing.modules.agent import Agent
+from dreamer_racing.modules import Agent, Interface, get_size
+from tests.export.recorded import make_agent
 from tests.forked import program
 from tests.running_recipes import ROOT, recipe_module
 
@@ -127,8 +127,7 @@ def test_every_copy_flies_as_the_policy_did(flown, latent: str, parts: bool, tmp
 
 
 def test_an_actor_without_one_takes_none() -> None:
-    agent = Agent(get_size("debug"), Interface(image_size=32), decode=False).requires_grad_(False)
-    step = make_step(agent, "mode")
+    step = make_step(make_agent(interface=Interface(image_size=32)), "mode")
     assert "imu" not in step.example_inputs()
     env = DroneRacingEnv("circle", 1, from_pixels=False)
     contract = make_contract(step, env.worlds.parameters, CAMERA)
