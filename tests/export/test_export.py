@@ -167,8 +167,8 @@ def copies(onnx: Path, program: Path) -> Callable[[ActorStep, Path, Path], None]
 
 def test_an_export_of_another_kind_leaves_nothing_of_an_earlier_one(agent, exports, tmp_path, monkeypatch) -> None:
     step, (whole, flight, _) = make_step(agent, "mode"), exports("mode")
-    monkeypatch.setattr(export, "write_step", copies(whole, whole.with_suffix(".pt2")))
     shutil.copytree(exports("block in parts").path.parent, tmp_path / "old")
+    monkeypatch.setattr(export, "write_step", copies(whole, whole.with_suffix(".pt2")))
     (tmp_path / "old" / "actor_act.onnx").unlink()  # gone already
     (tmp_path / "new").mkdir()
     (tmp_path / "new" / "weights.safetensors").write_text("mine")  # where no export has been
