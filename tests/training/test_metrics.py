@@ -1,30 +1,19 @@
-"""The metrics file, its resumption, and the episodes found in rollouts."""
+"""The metrics file, and its resumption."""
 
 from __future__ import annotations
 
 import csv
 import threading
 from contextlib import closing
-from enum import IntEnum
 from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
 import torch
-from hypothesis import given, settings
-from hypothesis import strategies as st
-from tensordict import TensorDict
 
 from dreamer_racing.figures.loggers import LoggerConfig, make_loggers
 from dreamer_racing.training import metrics as metrics_module
-from dreamer_racing.training.episodes import EpisodeTracker
 from dreamer_racing.training.metrics import Journal, MetricsLog
-
-
-class Cause(IntEnum):
-    NONE = 0
-    GROUND = 1
-    GATE = 2
 
 
 def read(run_dir: Path) -> list[dict[str, str]]:
@@ -236,89 +225,3 @@ def test_the_mean_of_several_counts_as_many(tmp_path):
         log.push({"episode/return": -4.0, "loss": torch.tensor(9.0)})
     log.push({}, 0)
     assert log.write(1) == pytest.approx({"episode/return": 1240 / 42, "loss": 154 / 42})
-
-
-# --- episodes ---
-
-
-def make_rollout(num_envs: int, steps: int, end: float, generator: torch.Generator) -> TensorDict:
-    def rand() -> torch.Tensor:
-        return torch.rand(num_envs, steps, 1, generator=generator)
-
-    done = rand() < end
-    crash = torch.where(done, (rand() * 3).long(), 0)
-    race = {"gates_passed": (rand() * 10).long(), "crash": crash, "finished": crash < 0}
-    arrived = {"reward": rand(), "done": done, "truncated": done & (crash == 0), "race": race}
-    return TensorDict({"is_init": torch.zeros_like(done), "next": arrived}, [num_envs, steps])
-
-
-def reference_episodes(rollouts: list[TensorDict]) -> list[dict]:
-    num_envs = rollouts[0].shape[0]
-    returns, lengths, episodes = [0.0] * num_envs, [0] * num_envs, []
-    for rollout in rollouts:
-        for time in range(rollout.shape[1]):
-            for env in range(num_envs):
-                step = rollout[env, time]["next"]
-                returns[env] += step["reward"].item()
-                lengths[env] += 1
-                if step["done"]:
-                    facts = {"gates_passed": step["race", "gates_passed"].item(), "crash": step["race", "crash"].item()}
-                    episodes.append({"env": env, "return": returns[env], "length": lengths[env], **facts})
-                    returns[env], lengths[env] = 0.0, 0
-    return episodes
-
-
-@settings(deadline=None, max_examples=25)
-@given(
-    num_envs=st.integers(1, 4),
-    steps=st.lists(st.integers(1, 12), min_size=1, max_size=4),
-    end=st.sampled_from([0.0, 0.1, 0.6, 1.0]),
-    seed=st.integers(0, 100),
-)
-def test_episodes_equal_a_step_by_step_count(num_envs, steps, end, seed):
-    generator = torch.Generator().manual_seed(seed)
-    rollouts = [make_rollout(num_envs, count, end, generator) for count in steps]
-    tracker, found = EpisodeTracker(num_envs), []
-    for rollout in rollouts:
-        resumed = EpisodeTracker(num_envs)
-        resumed.load_state_dict(tracker.state_dict())
-        tracker = resumed
-        found += [{key: value.item() for key, value in episode.items()} for episode in tracker.update(rollout)]
-    expected = reference_episodes(rollouts)
-    assert len(found) == len(expected)
-    for actual, episode in zip(found, expected, strict=True):
-        assert {key: actual[key] for key in episode} == pytest.approx(episode, rel=1e-5)
-
-
-def test_interrupted_episodes_are_forgotten():
-    generator = torch.Generator().manual_seed(0)
-    tracker = EpisodeTracker(2)
-    tracker.update(make_rollout(2, 5, 0.0, generator))
-    rollout = make_rollout(2, 3, 0.0, generator)
-    rollout["is_init"][0, 0] = True  # environment 0 was reset, as on resuming
-    rollout["next", "done"][:, -1] = True
-    assert tracker.update(rollout)["length"].tolist() == [3, 8]
-
-
-def test_summary():
-    tracker = EpisodeTracker(4, crash_causes=Cause)
-    rollout = make_rollout(4, 1, 1.0, torch.Generator().manual_seed(0))
-    rollout["next", "race", "crash"] = torch.tensor([0, 1, 1, 2]).view(4, 1, 1)
-    rollout["next", "race", "gates_passed"] = torch.tensor([1, 2, 3, 6]).view(4, 1, 1)
-    rollout["next", "reward"] = torch.tensor([1.0, 2.0, 3.0, 4.0]).view(4, 1, 1)
-    assert tracker.summary(tracker.update(rollout)) == {
-        "episode/return": 2.5,
-        "episode/length": 1.0,
-        "episode/gates_passed": 3.0,
-        "crash/ground": 0.5,
-        "crash/gate": 0.25,
-    }
-    rollout["next", "done"][:] = False
-    assert tracker.summary(tracker.update(rollout)) == {}
-
-
-def test_environments_without_a_race():
-    tracker = EpisodeTracker(2, crash_causes=Cause)
-    rollout = make_rollout(2, 4, 1.0, torch.Generator().manual_seed(0))
-    del rollout["next", "race"]
-    assert set(tracker.summary(tracker.update(rollout))) == {"episode/return", "episode/length"}
