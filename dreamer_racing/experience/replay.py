@@ -223,7 +223,8 @@ class StreamReplay(TensorDictReplayBuffer):
         fields = state["fields"]
         for field in fields:
             field["key"] = field["key"] if isinstance(field["key"], str) else tuple(field["key"])
-        layouts = {field["key"]: torch.empty(0, *field["shape"], dtype=_dtype(field)) for field in fields}
+            field["dtype"] = getattr(torch, field["dtype"].removeprefix("torch."))
+        layouts = {field["key"]: torch.empty(0, *field["shape"], dtype=field["dtype"]) for field in fields}
         for key, stored in self._storage.fields() if fields else ():
             if key not in layouts:
                 raise ValueError(f"The replay stores {key!r}, which the saved one does not have.")
@@ -252,13 +253,9 @@ class StreamReplay(TensorDictReplayBuffer):
             with (path / _FIELD.format(number)).open("rb") as file:
                 file.seek(sum(field["frames"][:frame]))
                 content = file.read(field["frames"][frame])
-            records.set(field["key"], _expanded(content, (filled[stream], *field["shape"]), _dtype(field)))
+            records.set(field["key"], _expanded(content, (filled[stream], *field["shape"]), field["dtype"]))
         start = target * self._writer.stream_length
         self._storage.set(slice(start, start + filled[stream]), records, set_cursor=False)
-
-
-def _dtype(field: dict[str, Any]) -> torch.dtype:
-    return getattr(torch, field["dtype"].removeprefix("torch."))
 
 
 def _compressed(records: Tensor) -> bytes:

@@ -64,20 +64,14 @@ def test_a_damaged_number_of_env_steps_costs_its_row_alone_and_is_said(tmp_path,
     assert [row["env_steps"] for row in read(tmp_path)] == ["10", "30"]
 
 
-def test_pushed_tensors_may_be_overwritten(tmp_path):
+def test_pushed_tensors_may_be_overwritten_and_their_graphs_are_not_kept(tmp_path):
     log = MetricsLog(tmp_path)
-    static = torch.tensor(1.0)  # as a CUDA graph's outputs are
+    static, weight = torch.tensor(0.0), torch.ones(3, requires_grad=True)  # static, as a CUDA graph's outputs are
     for value in (1.0, 2.0, 3.0):
-        static.fill_(value)
-        log.push({"loss": static})
-    assert log.write(1) == {"loss": 2.0}
-
-
-def test_graphs_are_not_kept(tmp_path):
-    log = MetricsLog(tmp_path)
-    log.push({"loss": torch.ones(3, requires_grad=True).sum()})
+        log.push({"loss": static.fill_(value), "norm": value * weight.sum()})
     averages = log._pending.averages.state_dict()["tensors"]
     assert averages and not any(total.requires_grad for _, total, _ in averages)
+    assert log.write(1) == {"loss": 2.0, "norm": 6.0}
 
 
 def test_pushing_does_not_read_tensors_and_a_write_reads_once(tmp_path, monkeypatch):

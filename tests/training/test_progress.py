@@ -42,19 +42,14 @@ def test_waiting_takes_wall_clock_alone_and_computing_both():
     assert computed["cpu_clock"] - waited["cpu_clock"] >= 0.03  # read in 1/100 s
 
 
-def test_a_continued_run_goes_on_where_it_was():
-    clock = RunClock({"env_steps": 3})
-    clock.total = {"wall_clock": 100.0, "cpu_clock": 60.0, "score": 1.0}
-    assert clock.total.keys() == {"wall_clock", "cpu_clock"}
-    assert 100.0 <= clock.read()["wall_clock"] < 110.0 and 60.0 <= clock.read()["cpu_clock"] < 70.0
-
-
-def test_what_was_made_before_a_run_was_continued_is_not_in_its_rates():
+def test_a_continued_run_goes_on_where_it_was_and_has_no_rates_of_what_was_before():
     counters = {"updates": 0}
     clock = RunClock(counters)
     counters["updates"] = 1_000_000  # restored
-    clock.total = {"wall_clock": 100.0, "cpu_clock": 60.0}
-    assert clock.read()["rate/updates"] == 0.0
+    clock.total = {"wall_clock": 100.0, "cpu_clock": 60.0, "score": 1.0}
+    assert clock.total.keys() == {"wall_clock", "cpu_clock"}
+    found = clock.read()
+    assert 100.0 <= found["wall_clock"] < 110.0 and 60.0 <= found["cpu_clock"] < 70.0 and found["rate/updates"] == 0.0
 
 
 def test_what_an_older_run_did_not_record_stays_unknown():
@@ -301,25 +296,17 @@ def test_an_evaluation_shows_how_far_it_is_and_leaves_nothing(monkeypatch: pytes
     assert not any("evaluating" in line for line in terminal.screen)
 
 
-def test_what_is_said_stands_above_and_the_table_stays(monkeypatch: pytest.MonkeyPatch) -> None:
-    terminal = open_terminal(monkeypatch)
-    with Progress(total=100) as progress:
-        progress.show(TRAINING)
-        progress.write_line("evaluation at 50 env_steps: gates 3.00 (the best so far)")
-    assert terminal.screen[0] == "evaluation at 50 env_steps: gates 3.00 (the best so far)"
-    assert terminal.screen[1].startswith("  0%|") and terminal.screen[3].split()[:3] == ["training", "0", "12.35"]
-    assert terminal.screen[5:] == [""]  # what a shell prints next begins below
-
-
-def test_what_is_logged_stands_above_and_the_table_stays(monkeypatch: pytest.MonkeyPatch) -> None:
-    terminal = open_terminal(monkeypatch)
+def test_what_is_said_or_logged_stands_above_and_the_table_stays(monkeypatch: pytest.MonkeyPatch) -> None:
+    terminal, said = open_terminal(monkeypatch), "evaluation at 50 env_steps: gates 3.00 (the best so far)"
     monkeypatch.setattr(logging.root, "handlers", [handler := logging.StreamHandler(terminal)])
     with Progress(total=100) as progress:
         progress.show(TRAINING)
+        progress.write_line(said)
         logging.getLogger("dreamer_racing.test").warning("the disk is slow\nfor 5 s")
         progress.show(TRAINING | {"loss": 0.75})
-        assert terminal.screen[:2] == ["the disk is slow", "for 5 s"] and len(terminal.screen) == 6
-        assert terminal.screen[2].startswith("  0%|") and terminal.screen[4].split()[:3] == ["training", "0", "12.35"]
+        assert terminal.screen[:3] == [said, "the disk is slow", "for 5 s"] and len(terminal.screen) == 7
+        assert terminal.screen[3].startswith("  0%|") and terminal.screen[5].split()[:3] == ["training", "0", "12.35"]
+    assert terminal.screen[7:] == [""]  # what a shell prints next begins below
     assert logging.root.handlers == [handler]
 
 

@@ -128,24 +128,17 @@ def test_without_a_limit_or_before_any_update_it_never_waits():
     assert lag.add_fresh_error({"loss": torch.tensor(1.0)}) == {}
 
 
-def test_a_restored_one_goes_on_as_if_it_had_never_stopped():
+def test_a_restored_one_goes_on_as_if_it_had_never_stopped_unless_the_limit_was_taken_away():
     lag = ModelLag(limit=1.25)
     measure(lag, 1.5)
     lag.add_training_error(of(0.5))
-    other = ModelLag(limit=1.25)
-    other.load_state_dict(lag.state_dict())
+    other, unlimited = ModelLag(limit=1.25), ModelLag(limit=None)
+    for restored in (other, unlimited):
+        restored.load_state_dict(lag.state_dict())
+    assert lag.waits and not unlimited.waits
     for ratio in (1.1, 3.0, 1.0, 1.0):
         assert measure(lag, ratio) == measure(other, ratio)
         assert (lag.waits, lag.state_dict()) == (other.waits, other.state_dict())
-
-
-def test_one_that_waited_goes_on_where_the_limit_was_taken_away():
-    lag = ModelLag(limit=1.25)
-    measure(lag, 1.5)
-    assert lag.waits
-    other = ModelLag(limit=None)
-    other.load_state_dict(lag.state_dict())
-    assert not other.waits
 
 
 def test_it_is_measured_once_a_period_and_tells_when_the_actor_waits(caplog: pytest.LogCaptureFixture):

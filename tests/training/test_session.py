@@ -73,14 +73,16 @@ class Run:
         events: what was evaluated after how many updates, and saved after how many env_steps.
     """
 
-    def __init__(self, path: Path, total: int, rollout: int, save_every: int = 0, resume: bool = False, **ahead: Any):
+    def __init__(
+        self, path: Path, total: int, rollout: int, resume: bool = False, fails_after: Any = None, **saves: Any
+    ):
         self.config = SimpleNamespace(
             total_env_steps=total,
             seed=0,
             resume=str(path) if resume else None,
             logger=SimpleNamespace(every=0, media=False),
             evaluation=SimpleNamespace(every=10 * total, first=0, stochastic=False),
-            checkpoint=SimpleNamespace(every=save_every, minutes=0.0, keep=99),
+            checkpoint=SimpleNamespace(**{"every": 0, "minutes": 0.0, "keep": 99} | saves),
         )
         self.events: list[tuple[str, int]] = []
         self.learner, self.on_update = Learner(), lambda updates: None
@@ -89,7 +91,7 @@ class Run:
         self.session = session = Session(self.config, directory, directory.claim(), lambda env_steps: None)
         report = SimpleNamespace(make=self._evaluate, close=lambda: None)
         env = SimpleNamespace(close=lambda: None)
-        rollouts, tracker = OneAhead(rollout, **ahead), EpisodeTracker(1)
+        rollouts, tracker = OneAhead(rollout, fails_after), EpisodeTracker(1)
         session.track(learner=self.learner, env=env, rollouts=rollouts, evaluator=report, tracker=tracker)
         save = session.checkpoints.save
 
@@ -126,7 +128,7 @@ class Run:
 @pytest.mark.parametrize("total", [40, 41, 48, 55])
 @pytest.mark.parametrize("rollout", [1, 7, 33])
 def test_a_run_ends_with_an_evaluation_of_all_that_it_made(total: int, rollout: int, tmp_path: Path) -> None:
-    run = Run(tmp_path, total, rollout, save_every=10)
+    run = Run(tmp_path, total, rollout, every=10)
     events = run.go()
     assert run.session.at_end and run.learner.updates == run.session.env_steps == run.session.counters["updates"]
     assert [updates for event, updates in events if event == "evaluated"] == [run.learner.updates]
@@ -135,9 +137,7 @@ def test_a_run_ends_with_an_evaluation_of_all_that_it_made(total: int, rollout: 
 
 
 def test_what_is_saved_has_the_rollout_under_way_and_its_updates(tmp_path: Path) -> None:
-    saved = [
-        env_steps for event, env_steps in Run(tmp_path, total=40, rollout=4, save_every=10).go() if event == "saved"
-    ]
+    saved = [env_steps for event, env_steps in Run(tmp_path, total=40, rollout=4, every=10).go() if event == "saved"]
     assert saved[0] == 16  # due at 12, with the four that were under way
 
 
@@ -166,13 +166,15 @@ def test_what_was_delivered_before_workers_were_lost_is_saved(tmp_path: Path) ->
     assert [env_steps_of(path) for path in (tmp_path / "checkpoints").glob("checkpoint-*")] == [12]
 
 
-@pytest.mark.parametrize(("every", "saved"), [(10**6, [112, 204]), (0, [204])])
-def test_a_run_that_saves_on_the_way_does_so_within_two_minutes(
-    every: int, saved: list[int], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+@pytest.mark.parametrize(
+    ("every", "minutes", "saved"), [(10**6, 0.0, [112, 204]), (0, 1.0, [76, 144, 204]), (0, 0.0, [204])]
+)
+def test_a_run_that_saves_on_the_way_does_so_within_two_minutes_and_then_by_the_clock(
+    every: int, minutes: float, saved: list[int], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     now = [0.0]
     monkeypatch.setattr("dreamer_racing.training.progress.time.monotonic", lambda: now[0])
-    run = Run(tmp_path, total=200, rollout=4, save_every=every)
+    run = Run(tmp_path, total=200, rollout=4, every=every, minutes=minutes)
 
     def pass_time(updates: int) -> None:
         now[0] = 60.0 * 0.015 * updates
