@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from typing import Any
 
 import pytest
 import torch
@@ -13,7 +14,7 @@ from torchrl.collectors import Collector
 from torchrl.data import Binary, Bounded, Composite, Unbounded
 from torchrl.envs import EnvBase, InitTracker, TransformedEnv
 
-from dreamer_racing.experience.replay import make_replay
+from dreamer_racing.experience.replay import StreamReplay, make_replay
 from dreamer_racing.experience.replay_place import replay_bytes
 from dreamer_racing.experience.streams import records_from_rollout
 from dreamer_racing.modules.rssm import LatentFormat
@@ -114,6 +115,33 @@ def counter(pixels: torch.Tensor) -> torch.Tensor:
     return flat[..., 1].long() * 256 + flat[..., 2].long()
 
 
+def stream(pixels: torch.Tensor) -> torch.Tensor:
+    """The environment that `CountingEnv` wrote into images."""
+    return pixels.flatten(-3)[..., 0]
+
+
+FORMAT = LatentFormat(belief=2, latents=1, classes=3)
+
+
+def with_latents(rollout: TensorDict) -> TensorDict:
+    """Latents that tell the step at which they were left: belief (step, environment) / 1000, state step mod 3."""
+    envs, steps = rollout.shape
+    step = torch.arange(1, steps + 1).expand(envs, steps)
+    env = torch.arange(envs).unsqueeze(-1).expand(envs, steps)
+    rollout["next", "belief"] = torch.stack((step, env), -1) / 1000
+    rollout["next", "state"] = torch.nn.functional.one_hot(step % 3, 3).float()
+    return rollout
+
+
+def filled(num_envs: int = 3, length: int = 20, **arguments: Any) -> StreamReplay:
+    """A replay of so many records a stream, with a rollout of 15 steps."""
+    env = CountingEnv(num_envs, image_shape=arguments.pop("image_shape", (2, 2, 2)))
+    replay = make_replay(num_envs * length, num_envs, 6, 4, **arguments)
+    (rollout,) = collect(env, steps=15, batches=1)
+    replay.extend(with_latents(rollout) if "latents" in arguments else rollout)
+    return replay
+
+
 @settings(deadline=None, max_examples=40)
 @given(
     num_envs=st.integers(1, 4),
@@ -197,11 +225,6 @@ def test_a_share_of_the_windows_is_recent():
     assert age[:2_500].max() == 39
     with pytest.raises(ValueError, match="recent_share=1.5"):
         make_replay(100, 1, 1, 4, recent_share=1.5)
-
-
-def stream(pixels: torch.Tensor) -> torch.Tensor:
-    """The environment that `CountingEnv` wrote into images."""
-    return pixels.flatten(-3)[..., 0]
 
 
 def test_streams_that_are_held_out_are_never_sampled():
@@ -313,28 +336,41 @@ def test_dump_and_load_continue_the_same_samples(tmp_path):
 
 
 def test_an_empty_replay_is_saved_too(tmp_path):
-    emptied = make_replay(100, 2, 4, 5)
-    emptied.extend(collect(CountingEnv(2), steps=5, batches=1)[0])
+    emptied = filled()
     emptied.empty()
-    for replay in (make_replay(100, 2, 4, 5), emptied):
+    for replay in (make_replay(60, 3, 6, 4), emptied):
         replay.dump(tmp_path)
-        restored = make_replay(100, 2, 4, 5)
+        restored = make_replay(60, 3, 6, 4)
         restored.load(tmp_path)
-        assert len(restored) == 0
-        assert len(restored.records(0)) == 0
+        assert len(restored) == len(restored.records(0)) == 0
 
 
-def test_load_refuses_other_shapes(tmp_path):
-    replay = make_replay(60, 3, 6, 4)
-    replay.extend(collect(CountingEnv(3), steps=15, batches=1)[0])
-    replay.dump(tmp_path)
-    with pytest.raises(ValueError, match="3 streams of 20 records, this one has 2 of 30"):
-        make_replay(60, 2, 6, 4).load(tmp_path)
-    other = make_replay(60, 3, 6, 4)
-    other.extend(collect(CountingEnv(3, image_shape=(3, 3, 3)), steps=5, batches=1)[0])
-    with pytest.raises(ValueError, match="pixels"):
+@pytest.mark.parametrize(
+    ("saved", "here", "words"),
+    [
+        ({}, {"num_envs": 2}, "3 streams of 20 records, this one has 2 of 20"),
+        ({}, {"length": 30}, "3 streams of 20 records, this one has 3 of 30"),
+        ({}, {"image_shape": (3, 3, 3)}, "pixels"),
+        ({"reward_keys": ("reward",)}, {}, "stores 'reward_base', which the saved one does not have"),
+    ],
+    ids=["streams", "records", "shape", "field"],
+)
+def test_load_refuses_another_layout_and_leaves_what_is_there(tmp_path, saved, here, words):
+    filled(**saved).dump(tmp_path)
+    other = filled(**here)
+    before = other.writer.state_dict()
+    with pytest.raises(ValueError, match=words):
         other.load(tmp_path)
-    assert int(other.writer.filled.sum()) == len(other) < len(replay)
+    assert other.writer.state_dict() == before and int(other.writer.filled.sum()) == len(other)
+
+
+@pytest.mark.parametrize("kept", [True, False])
+def test_a_replay_with_latents_and_one_without_are_told_apart(kept, tmp_path):
+    with_them, without = {"latents": FORMAT}, {}
+    filled(**(with_them if kept else without)).dump(tmp_path)
+    other = make_replay(60, 3, 6, 4, **(without if kept else with_them))
+    with pytest.raises(ValueError, match=f"resume with replay.context={str(kept).lower()}"):
+        other.load(tmp_path)
 
 
 def test_repeated_records_compress_well(tmp_path):
@@ -354,9 +390,7 @@ def test_repeated_records_compress_well(tmp_path):
     ],
 )
 def test_load_refuses_what_does_not_fit_together(tmp_path, change, message):
-    replay = make_replay(60, 3, 6, 4)
-    replay.extend(collect(CountingEnv(3), steps=15, batches=1)[0])
-    replay.dump(tmp_path)
+    filled().dump(tmp_path)
     state = json.loads((tmp_path / "replay.json").read_text())
     if change:
         change(next(field for field in state["fields"] if field["key"] == "pixels"))
@@ -366,16 +400,6 @@ def test_load_refuses_what_does_not_fit_together(tmp_path, change, message):
             frames.write(bytes(4))
     with pytest.raises(ValueError, match=message):
         make_replay(60, 3, 6, 4).load(tmp_path)
-
-
-def test_load_refuses_a_replay_that_lacks_a_field(tmp_path):
-    rollout = collect(CountingEnv(3), steps=15, batches=1)[0]
-    replay, other = make_replay(60, 3, 6, 4, reward_keys=("reward",)), make_replay(60, 3, 6, 4)
-    for filled in (replay, other):
-        filled.extend(rollout)
-    replay.dump(tmp_path)
-    with pytest.raises(ValueError, match="stores 'reward_base', which the saved one does not have"):
-        other.load(tmp_path)
 
 
 def test_errors_say_what_is_wrong():
@@ -396,29 +420,14 @@ def test_errors_say_what_is_wrong():
 
 
 def test_size_is_known_before_allocation():
-    replay = make_replay(60, 3, 6, 4)
-    replay.extend(collect(CountingEnv(3), steps=5, batches=1)[0])
-    assert replay.storage._storage.bytes() == replay_bytes(60, (2, 2, 2))
+    assert filled().storage._storage.bytes() == replay_bytes(60, (2, 2, 2))
     assert replay_bytes(1_000_000) == pytest.approx(12.3e9, rel=0.01)
-
-
-FORMAT = LatentFormat(belief=2, latents=1, classes=3)
-
-
-def with_latents(rollout: TensorDict, first: int) -> TensorDict:
-    """Latents that tell the step at which they were left: belief (step, environment) / 1000, state step mod 3."""
-    envs, steps = rollout.shape
-    step = first + torch.arange(steps).expand(envs, steps)
-    env = torch.arange(envs).unsqueeze(-1).expand(envs, steps)
-    rollout["next", "belief"] = torch.stack((step, env), -1) / 1000
-    rollout["next", "state"] = torch.nn.functional.one_hot(step % 3, 3).float()
-    return rollout
 
 
 def test_context_is_what_was_left_before_each_observation_and_zero_at_first_ones():
     replay = make_replay(60, 3, 6, 4, latents=FORMAT)
     (rollout,) = collect(CountingEnv(3), steps=12, batches=1)
-    replay.extend(with_latents(rollout, first=1))
+    replay.extend(with_latents(rollout))
     for env in range(3):
         records = replay.records(env)
         arrived = ~records["is_init"].squeeze(-1)
@@ -432,7 +441,7 @@ def test_context_is_what_was_left_before_each_observation_and_zero_at_first_ones
 def test_refreshing_reaches_the_records_after_those_seen_and_no_others():
     replay = make_replay(39, 3, 2, 4, latents=FORMAT)  # full
     (rollout,) = collect(CountingEnv(3, end=0.0), steps=12, batches=1)
-    replay.extend(with_latents(rollout, first=1))
+    replay.extend(with_latents(rollout))
     before = replay.storage._storage.clone()
     batch = replay.sample()
     belief, state = torch.full((2, 4, 2), 0.5), torch.nn.functional.one_hot(torch.full((2, 4), 2), 3).float()
@@ -448,7 +457,7 @@ def test_refreshing_reaches_the_records_after_those_seen_and_no_others():
 
 def test_where_windows_overlap_the_last_one_is_kept_and_nobody_waits():
     replay = make_replay(39, 3, 2, 4, latents=FORMAT)
-    replay.extend(with_latents(collect(CountingEnv(3, end=0.0), steps=12, batches=1)[0], first=1))
+    replay.extend(with_latents(collect(CountingEnv(3, end=0.0), steps=12, batches=1)[0]))
     slots = torch.tensor([[2, 3, 4, 5], [3, 4, 5, 6]])
     belief = torch.arange(8.0).view(2, 4, 1).expand(2, 4, 2) / 8  # exact in float16
     for shift in (0.0, 0.5):  # what the first call remembers of slots must not show in the second
@@ -459,8 +468,7 @@ def test_where_windows_overlap_the_last_one_is_kept_and_nobody_waits():
 
 
 def test_samples_are_drawn_without_waiting():
-    replay = make_replay(60, 3, 6, 4, latents=FORMAT, recent_share=0.5)
-    replay.extend(with_latents(collect(CountingEnv(3), steps=5, batches=1)[0], first=1))
+    replay = filled(latents=FORMAT, recent_share=0.5)
     slots = replay._sampler.sample(replay.storage, 6)[0]  # on the CPU, whatever the storage is on
     seen = launches(lambda: replay.storage.get(slots))
     assert (seen.waits, seen.mixed) == ([], []) and seen.count > 0
@@ -468,8 +476,7 @@ def test_samples_are_drawn_without_waiting():
 
 @pytest.mark.parametrize("kept_on", ["meta", "cpu"])
 def test_what_comes_with_a_sample_is_brought_without_waiting(kept_on):
-    replay = make_replay(60, 3, 6, 4, device="meta", storage_device=kept_on, recent_share=0.5)  # in a GPU's place
-    replay.extend(collect(CountingEnv(3), steps=5, batches=1)[0])
+    replay = filled(device="meta", storage_device=kept_on, recent_share=0.5)  # in a GPU's place
     seen = launches(replay.sample)
     assert {place.split(" at ")[1].split(":")[0] for place in seen.mixed} <= {
         "experience/streams.py",  # `send`
@@ -485,7 +492,7 @@ def test_a_replay_on_cuda_is_written_sampled_and_refreshed_as_one_on_the_cpu():
     for device in ("cpu", "cuda"):
         replay = make_replay(60, 3, 6, 4, device=device, latents=FORMAT)
         for rollout in collect(CountingEnv(3), steps=5, batches=3):
-            replay.extend(with_latents(rollout, first=1).to(device))
+            replay.extend(with_latents(rollout).to(device))
         batch = replay.sample()
         latents = torch.full((6, 4, 2), 0.5, device=device), torch.ones(6, 4, 3, device=device)
         replay.refresh(batch["index"], *latents)
@@ -501,8 +508,7 @@ def test_a_replay_on_cuda_is_written_sampled_and_refreshed_as_one_on_the_cpu():
 
 
 def test_context_survives_a_checkpoint_and_counts_in_the_size(tmp_path):
-    replay, restored = (make_replay(60, 3, 6, 4, seed=seed, latents=FORMAT) for seed in (5, 6))
-    replay.extend(with_latents(collect(CountingEnv(3), steps=5, batches=1)[0], first=1))
+    replay, restored = filled(seed=5, latents=FORMAT), make_replay(60, 3, 6, 4, seed=6, latents=FORMAT)
     assert replay.storage._storage.bytes() == replay_bytes(60, (2, 2, 2), latents=FORMAT)
     replay.dump(tmp_path)
     restored.load(tmp_path)
@@ -513,13 +519,3 @@ def test_a_rollout_without_latents_is_refused_where_they_are_kept():
     replay = make_replay(60, 3, 6, 4, latents=FORMAT)
     with pytest.raises(KeyError, match="'belief'.*'state'"):
         replay.extend(collect(CountingEnv(3), steps=5, batches=1)[0])
-
-
-@pytest.mark.parametrize("kept", [True, False])
-def test_a_replay_with_latents_and_one_without_are_told_apart(kept, tmp_path):
-    saved, other = (make_replay(60, 3, 6, 4, latents=FORMAT if latents else None) for latents in (kept, not kept))
-    rollout = collect(CountingEnv(3), steps=5, batches=1)[0]
-    saved.extend(with_latents(rollout, first=1) if kept else rollout)
-    saved.dump(tmp_path)
-    with pytest.raises(ValueError, match=f"resume with replay.context={str(kept).lower()}"):
-        other.load(tmp_path)
