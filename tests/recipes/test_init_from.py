@@ -10,7 +10,7 @@ import torch
 
 from dreamer_racing.export.shipped_agent import WEIGHTS
 from dreamer_racing.export.weights_file import read_weights
-from tests.running_recipes import ROOT, TINY, build, prepared, recipe_module
+from tests.running_recipes import ROOT, TINY, prepared, recipe_module
 
 NUMBERS = [*TINY, "env.from_pixels=false", "prefill=64", "model.average_rate=0.1"]
 AS_SHIPPED = ["tuned=race", "model=cpu_small", "prefill=4000", "total_env_steps=8000", "replay.capacity=20000"]
@@ -76,34 +76,27 @@ def test_the_networks_of_an_agent_that_ships(tmp_path: Path, capsys: pytest.Capt
 @pytest.mark.parametrize(
     ("overrides", "words"),
     [
-        (
-            [*NUMBERS, "init_from=nowhere"],
-            ["init_from=nowhere: there is no such file or folder", "by name: circle"],
-        ),
+        ([*NUMBERS, "init_from=nowhere"], ["init_from=nowhere: there is no such file or folder", "by name: circle"]),
         ([*TINY, "init_from=kidney"], ["size 'cpu_small'", "size 'debug'"]),
         ([*AS_SHIPPED, "init_from=kidney", "env.control_rate=50"], ["control_rate"]),
         ([*AS_SHIPPED, "init_from=kidney", "env.camera_tilt=10"], ["camera_tilt"]),
+        ([*NUMBERS, "init_from=first", "env.control_rate=25"], ["env.control_rate=25.0: init_from="]),
+        (
+            [*NUMBERS, "init_from=first", "model=size1m", "model.batch_length=8", "model.batch_size=2"],
+            ["Weights cannot be converted between sizes"],
+        ),
     ],
 )
 def test_what_does_not_fit_is_refused(
-    overrides: list[str], words: list[str], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    overrides: list[str],
+    words: list[str],
+    saved: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
 ) -> None:
+    monkeypatch.chdir(saved.parent)
     with pytest.raises(SystemExit), recipe_module("composing.entry").plain_errors():
         prepared(*overrides, f"run_dir={tmp_path / 'run'}")
     said = capsys.readouterr().err
     assert all(word in said for word in words), said
-
-
-@pytest.mark.parametrize(
-    ("overrides", "words"),
-    [
-        (["env.control_rate=25"], "env.control_rate=25.0: init_from="),
-        (["model=size1m", "model.batch_length=8", "model.batch_size=2"], "Weights cannot be converted between sizes"),
-    ],
-)
-def test_a_run_at_another_rate_or_of_another_size_is_refused(
-    overrides: list[str], words: str, trained: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    with pytest.raises(SystemExit):
-        build(*NUMBERS, f"run_dir={trained.parent / 'next'}", f"init_from={trained}", *overrides)
-    assert words in capsys.readouterr().err
