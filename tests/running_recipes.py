@@ -113,6 +113,13 @@ def python(
     )  # fmt: skip
 
 
+def refused(name: str, *overrides: str, status: int = 2, **given: Any) -> str:
+    """Run a recipe as `recipe` does, to an end in plain words; return them."""
+    done = recipe(name, *overrides, **given)
+    assert done.returncode == status and "Traceback" not in done.stderr, done.stderr
+    return done.stderr
+
+
 def build(*overrides: str, name: str = "dreamer_v3") -> None:
     """Resolve a configuration and make all parts of a run, as a recipe does, in this process."""
     with recipe_module("composing.entry").plain_errors():

@@ -18,7 +18,7 @@ from dreamer_racing.export.onnx_actor import read_contract
 from dreamer_racing.export.shipped_agent import FILES, ShippedAgent, is_agent
 from dreamer_racing.training.directory import RunDirectory, latest_checkpoint
 from dreamer_racing.training.publishing import write_checksums
-from tests.running_recipes import ROOT, UNDRAWN, completed, recipe, recipe_module
+from tests.running_recipes import ROOT, UNDRAWN, completed, recipe_module, refused
 
 pytest.importorskip("onnxscript")
 pytest.importorskip("onnxruntime")
@@ -31,12 +31,11 @@ EVALUATION = ("episodes=1", "num_envs=1", "video_steps=5")
 def run_dir(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A finished debug run that is privileged, sees small images and keeps averaged weights."""
     directory = tmp_path_factory.mktemp("runs") / "run"
-    done = recipe(
+    completed(
         "dreamer_v3", "track=circle", "model=debug", "model.average_rate=0.1", "loss=privileged", "env.image_size=32",
         "env.control_rate=25", "env.num_envs=4", "prefill=100", "total_env_steps=160", "replay.capacity=1000",
         "evaluation.every=0", f"run_dir={directory}", cwd=directory.parent, before=UNDRAWN,
     )  # fmt: skip
-    assert done.returncode == 0, done.stderr
     return directory
 
 
@@ -45,17 +44,15 @@ def agent(run_dir: Path) -> Path:
     """An agent made of that run, and its evaluation."""
     folder = run_dir.parent / "agents" / "mine"
     command = ("export", f"checkpoint={run_dir}", f"agent={folder}", "commit=abc1234")
-    early = recipe(*command, cwd=run_dir.parent)
-    assert early.returncode == 2 and "an agent ships with its results. Make it with: " in early.stderr
-    assert "recipes/evaluate.py checkpoint=" in early.stderr
+    early = refused(*command, cwd=run_dir.parent)
+    assert "an agent ships with its results. Make it with: " in early and "recipes/evaluate.py checkpoint=" in early
     assert not is_agent(folder)
     of_trained = (f"checkpoint={run_dir}", "weights=trained", *EVALUATION)
-    trained = recipe("evaluate", *of_trained, cwd=run_dir.parent, before=UNDRAWN)
-    assert trained.returncode == 0 and "weights: trained\n" in trained.stdout, trained.stderr
-    other = recipe(*command, cwd=run_dir.parent)
-    assert other.returncode == 2 and "evaluation of other weights" in other.stderr, "trained, not averaged ones"
-    averaged = recipe("evaluate", f"checkpoint={run_dir}", *EVALUATION, cwd=run_dir.parent)
-    assert averaged.returncode == 0 and "weights: averaged (weights=auto)" in averaged.stdout, averaged.stderr
+    trained = completed("evaluate", *of_trained, cwd=run_dir.parent, before=UNDRAWN)
+    assert "weights: trained\n" in trained.stdout
+    assert "evaluation of other weights" in refused(*command, cwd=run_dir.parent), "trained, not averaged ones"
+    averaged = completed("evaluate", f"checkpoint={run_dir}", *EVALUATION, cwd=run_dir.parent)
+    assert "weights: averaged (weights=auto)" in averaged.stdout
     completed(*command, f"evaluation={run_dir}/evaluation_2/evaluation.json", cwd=run_dir.parent)
     return folder
 
@@ -98,8 +95,8 @@ def test_an_agent_is_flown_evaluated_and_exported_as_its_run_is(agent: Path, run
     contract = json.loads((tmp_path / "runs" / "agent_mine" / "export" / "contract.json").read_text())
     assert contract["weights_sha256"] == written["provenance"]["weights_sha256"]
     before = {path.name: path.read_bytes() for path in agent.iterdir()}
-    done = recipe("export", f"checkpoint={agent}", f"output={agent}/actor.onnx", cwd=tmp_path)
-    assert done.returncode == 2 and "holds an agent, which is kept: choose another" in done.stderr, done.stderr
+    said = refused("export", f"checkpoint={agent}", f"output={agent}/actor.onnx", cwd=tmp_path)
+    assert "holds an agent, which is kept: choose another" in said
     assert {path.name: path.read_bytes() for path in agent.iterdir()} == before
 
 

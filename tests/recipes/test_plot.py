@@ -2,32 +2,25 @@
 
 from __future__ import annotations
 
-import importlib
 import json
 import re
 from functools import partial
 from pathlib import Path
-from types import ModuleType
+from typing import Any
 
 import pytest
 from omegaconf import OmegaConf
 
 from dreamer_racing.evaluation.trajectory import write_trajectory
+from dreamer_racing.figures import plotting
 from dreamer_racing.figures.curves import read_curves
 from tests.figures.test_curves import write_run
 from tests.figures.test_flights import flat_dream, random_flight
-from tests.running_recipes import ROOT, recipe_module
-from tests.running_recipes import recipe as recipe_process
+from tests.running_recipes import ROOT, completed, recipe, recipe_module, refused
 
 pytestmark = pytest.mark.xdist_group("figures")  # one worker makes what these tests share
 
-plot = partial(recipe_process, "plot")
-
-
-@pytest.fixture(scope="module")
-def recipe() -> ModuleType:
-    """What the recipe draws with."""
-    return importlib.import_module("dreamer_racing.figures.plotting")
+plot = partial(completed, "plot")
 
 
 @pytest.fixture
@@ -42,10 +35,16 @@ def runs(tmp_path: Path) -> Path:
     return tmp_path
 
 
+def draw(runs: Path, **settings: Any) -> Path:
+    """Draw figures of the runs, unless of others; return the folder that they are drawn to."""
+    config = plotting.PlotConfig(**{"runs": str(runs / "runs"), "output": str(runs / "figures")} | settings)
+    plotting.draw(config)
+    return runs / "figures"
+
+
 def test_all_figures_and_the_curves_again_from_their_csv(runs):
     (write_run(runs / "runs", "ppo_circle_paper_seed0", algorithm="ppo") / "metrics.csv").write_text("")
     done = plot("aggregate=iqm", "quantities=[return,success_rate]", "flight=best", cwd=runs)
-    assert done.returncode == 0, done.stderr
     made = {path.name for path in (runs / "figures").iterdir()}
     dream = "imagined_dreamer_v3_circle_paper_seed0"
     assert made == {
@@ -55,22 +54,20 @@ def test_all_figures_and_the_curves_again_from_their_csv(runs):
     assert "warning: ppo_circle_paper_seed0 left out: metrics.csv has no rows" in done.stdout
     curves = read_curves(runs / "figures" / "learning_curves.csv")
     assert curves.aggregate == "iqm" and [curve.quantity for curve in curves.curves] == ["return", "success_rate"]
-    done = plot("runs=figures/learning_curves.csv", "output=again", cwd=runs)
-    assert done.returncode == 0, done.stderr
+    plot("runs=figures/learning_curves.csv", "output=again", cwd=runs)
     made = {path.name for path in (runs / "again").iterdir()}
     assert made == {"learning_curves.png", "learning_curves_left_out.txt"}
-    done = plot("runs=figures", "output=once_more", cwd=runs)
-    assert done.returncode == 0 and (runs / "once_more" / "learning_curves.png").is_file(), done.stderr
-    done = plot("runs=figures/learning_curves.csv", "figure=comparison", "quantities=[gates]", cwd=runs)
-    assert done.returncode == 2 and "quantities=, figure=: runs=figures/learning_curves.csv is a file" in done.stderr
+    plot("runs=figures", "output=once_more", cwd=runs)
+    assert (runs / "once_more" / "learning_curves.png").is_file()
+    said = refused("plot", "runs=figures/learning_curves.csv", "figure=comparison", "quantities=[gates]", cwd=runs)
+    assert "quantities=, figure=: runs=figures/learning_curves.csv is a file" in said
 
 
-def test_flights_and_dreams_by_name_need_no_runs(runs, recipe):
-    folder, output = runs / "runs" / "dreamer_v3_circle_paper_seed1" / "evaluations", runs / "figures"
+def test_flights_and_dreams_by_name_need_no_runs(runs):
+    folder = runs / "runs" / "dreamer_v3_circle_paper_seed1" / "evaluations"
     flights, dreams = [str(folder / "000001000_trajectory.csv")], [str(folder / "000002000_dream.npz")]
     for figure in ("trajectories", "imagined"):
-        options = {"flights": flights, "dreams": dreams, "output": str(output), "runs": "nowhere"}
-        recipe.draw(recipe.PlotConfig(figure=figure, **options))
+        output = draw(runs, figure=figure, flights=flights, dreams=dreams, runs="nowhere")
     assert {path.name for path in output.iterdir()} == {
         "trajectories.png", "imagined.png", "imagined.mp4", "imagined.gif"
     }  # fmt: skip
@@ -78,27 +75,26 @@ def test_flights_and_dreams_by_name_need_no_runs(runs, recipe):
 
 def test_a_single_flight_and_what_an_evaluation_after_training_left_are_drawn(runs):
     evaluations = runs / "runs" / "dreamer_v3_circle_paper_seed0" / "evaluations"
-    done = plot(f"flights={evaluations}/000001000_trajectory.csv", "figure=trajectories", "output=one", cwd=runs)
-    assert done.returncode == 0 and (runs / "one" / "trajectories.png").is_file(), done.stderr
+    plot(f"flights={evaluations}/000001000_trajectory.csv", "figure=trajectories", "output=one", cwd=runs)
+    assert (runs / "one" / "trajectories.png").is_file()
     (runs / "elsewhere").mkdir()
-    done = plot(f"flights={evaluations}/000001000_trajectory.csv", cwd=runs / "elsewhere")
-    assert done.returncode == 0, done.stderr
+    plot(f"flights={evaluations}/000001000_trajectory.csv", cwd=runs / "elsewhere")
     assert {path.name for path in (runs / "elsewhere" / "figures").iterdir()} == {"trajectories.png"}
     after = evaluations.parent / "evaluation"
     after.mkdir()
     evaluations.rename(after / "evaluations")
     for file in (after / "evaluations").glob("000001000*"):
         file.rename(file.with_name(file.name.replace("000001000", "deterministic")))
-    done = plot(f"runs={after.parent}", "output=after", "quantities=gates", cwd=runs)
+    done = recipe("plot", f"runs={after.parent}", "output=after", "quantities=gates", cwd=runs)
     made = {path.name for path in (runs / "after").iterdir()}
     assert {"trajectories.png", "imagined_dreamer_v3_circle_paper_seed0.png"} <= made, done.stderr
 
 
 @pytest.mark.parametrize(("which", "expected"), [("best", "1,000"), ("last", "2,000")])
-def test_last_and_best_flight(runs, recipe, which, expected):
-    read, _ = recipe.read_runs(recipe.find_runs([runs / "runs"]))
+def test_last_and_best_flight(runs, which, expected):
+    read, _ = plotting.read_runs(plotting.find_runs([runs / "runs"]))
     problems: list[str] = []
-    (flight,) = recipe.chosen_flights(read, which, problems)
+    (flight,) = plotting.chosen_flights(read, which, problems)
     assert flight.title == f"dreamer_v3_circle_paper_seed0, {expected} env_steps" and problems == []
 
 
@@ -109,27 +105,26 @@ def cut(path: Path) -> str:
 
 
 @pytest.mark.parametrize("which", ["best", "last"])
-def test_instead_of_half_a_flight_the_next_one_is_drawn(runs, recipe, figures, caplog, which):
+def test_instead_of_half_a_flight_the_next_one_is_drawn(runs, figures, caplog, which):
     folder = runs / "runs" / "dreamer_v3_circle_paper_seed0" / "evaluations"
     chosen, other = ("1", "2") if which == "best" else ("2", "1")
     cut(folder / f"00000{chosen}000_trajectory.csv")
-    recipe.draw(recipe.PlotConfig(figure="trajectories", flight=which, runs=str(runs / "runs"), output=str(runs / "f")))
+    output = draw(runs, figure="trajectories", flight=which)
     assert f"{other},000 env_steps" in figures[0].axes[0].get_title(loc="left")
-    warning = (
-        f"dreamer_v3_circle_paper_seed0 without 00000{chosen}000_trajectory.csv: 00000{chosen}000_trajectory.csv was"
-    )
+    file = f"00000{chosen}000_trajectory.csv"
+    warning = f"dreamer_v3_circle_paper_seed0 without {file}: {file} was"
     assert warning in caplog.text
-    assert (runs / "f" / "trajectories_left_out.txt").read_text().startswith(warning)
+    assert (output / "trajectories_left_out.txt").read_text().startswith(warning)
 
 
-def test_instead_of_half_a_dream_the_one_before_it_is_shown(runs, recipe):
+def test_instead_of_half_a_dream_the_one_before_it_is_shown(runs):
     folder = runs / "runs" / "dreamer_v3_circle_paper_seed0" / "evaluations"
     for env_steps in (3000, 4000, 5000):
         flat_dream().save(folder / f"{env_steps:09d}_dream.npz")
 
     def shown() -> tuple[list[str], list[str]]:
-        ((run, _), _) = recipe.read_runs(recipe.find_runs([runs / "runs"]))
-        stages, problems = recipe.stages_of_training(run)
+        ((run, _), _) = plotting.read_runs(plotting.find_runs([runs / "runs"]))
+        stages, problems = plotting.stages_of_training(run)
         return [file.name[5:9] for file in stages], problems
 
     assert shown() == (["1000", "3000", "5000"], [])
@@ -148,26 +143,24 @@ def test_instead_of_half_a_dream_the_one_before_it_is_shown(runs, recipe):
     assert shown()[0] == ["2000", "4000"]
 
 
-def test_nothing_but_half_files_costs_no_other_figure(runs, recipe, caplog):
+def test_nothing_but_half_files_costs_no_other_figure(runs, caplog):
     caplog.set_level("INFO", "dreamer_racing")
     for path in (runs / "runs").rglob("*_dream.npz"):
         cut(path)
     for path in (runs / "runs").rglob("*_trajectory.csv"):
         cut(path)
-    recipe.draw(recipe.PlotConfig(runs=str(runs / "runs"), output=str(runs / "figures")))
-    assert {path.name for path in (runs / "figures").iterdir()} == {"learning_curves.png", "learning_curves.csv"}
+    assert {path.name for path in draw(runs).iterdir()} == {"learning_curves.png", "learning_curves.csv"}
     out = caplog.text
     assert "paper_seed0 without 000002000_trajectory.csv and 1 other: 000002000_trajectory.csv was cut short" in out
     assert "paper_seed0 without 000002000_dream.npz and 1 other: 000002000_dream.npz holds no dream" in out
 
 
 @pytest.mark.parametrize(("figure", "option"), [("trajectories", "flights"), ("imagined", "dreams")])
-def test_half_a_file_that_the_user_named_is_refused(runs, recipe, figure, option):
+def test_half_a_file_that_the_user_named_is_refused(runs, figure, option):
     ending = {"flights": "trajectory.csv", "dreams": "dream.npz"}[option]
     file = cut(runs / "runs" / "dreamer_v3_circle_paper_seed0" / "evaluations" / f"000002000_{ending}")
-    settings = {option: [file], "runs": str(runs / "runs"), "output": str(runs / "figures")}
     with pytest.raises(ValueError, match=f"{ending}"):
-        recipe.draw(recipe.PlotConfig(figure=figure, **settings))
+        draw(runs, figure=figure, **{option: [file]})
 
 
 @pytest.mark.parametrize(
@@ -180,37 +173,31 @@ def test_half_a_file_that_the_user_named_is_refused(runs, recipe, figure, option
         ({"over": "height"}, "over=height: must be one of distance, time"),
     ],
 )
-def test_bad_settings_are_refused(runs, recipe, settings, words):
-    given = {"runs": str(runs / "runs"), "output": str(runs / "figures")} | settings
+def test_bad_settings_are_refused(runs, settings, words):
     with pytest.raises(ValueError, match=words):
-        recipe.draw(recipe.PlotConfig(**given))
+        draw(runs, **settings)
 
 
 @pytest.mark.parametrize("setting", ["flights", "dreams"])
 @pytest.mark.parametrize("figure", ["all", "learning_curves", "trajectories"])
-def test_a_named_file_that_is_not_there_is_refused_for_any_figure(setting, figure, runs, recipe):
-    output = runs / "refused"
-    config = recipe.PlotConfig(**{setting: ["nowhere.npz"]}, figure=figure, runs=str(runs / "runs"), output=str(output))
+def test_a_named_file_that_is_not_there_is_refused_for_any_figure(setting, figure, runs):
     with pytest.raises(ValueError, match=f"{setting}=nowhere.npz: there is no such file"):
-        recipe.draw(config)
-    assert not output.exists()
+        draw(runs, figure=figure, **{setting: ["nowhere.npz"]})
+    assert not (runs / "figures").exists()
 
 
-def test_one_variant_is_not_compared(runs, recipe):
-    config = recipe.PlotConfig(figure="comparison", runs=str(runs / "runs" / "dreamer_v3_circle_paper_seed0"))
-    config.output = str(runs / "figures")
+def test_one_variant_is_not_compared(runs):
     with pytest.raises(ValueError, match="figure=comparison: these runs have only one variant; runs= takes several"):
-        recipe.draw(config)
+        draw(runs, figure="comparison", runs=str(runs / "runs" / "dreamer_v3_circle_paper_seed0"))
 
 
-def test_an_ordinary_folder_of_runs_is_drawn_as_curves_named_by_what_differs(runs, recipe, figures):
+def test_an_ordinary_folder_of_runs_is_drawn_as_curves_named_by_what_differs(runs, figures):
     """As `runs/` is after a few days: names with a date, settings tried out, and a seed flown twice."""
     for name, overrides in (("101-120000", []), ("102-120000", ["env.preset=faithful"]), ("103-120000", [])):
         preset = "faithful" if overrides else "easy"
         run = write_run(runs / "ordinary", f"dreamer_v3_circle_20260{name}", env={"preset": preset})
         (run / "overrides.yaml").write_text(json.dumps(["track=circle", *overrides]))
-    recipe.draw(recipe.PlotConfig(runs=str(runs / "ordinary"), output=str(runs / "figures")))
-    made = {path.name for path in (runs / "figures").iterdir()}
+    made = {path.name for path in draw(runs, runs=str(runs / "ordinary")).iterdir()}
     assert made >= {"learning_curves.png", "comparison.png", "learning_curves_left_out.txt"}
     (legend,) = [child for child in figures[0].axes[-1].get_children() if hasattr(child, "get_texts")]
     assert [text.get_text() for text in legend.get_texts()] == [
@@ -220,38 +207,38 @@ def test_an_ordinary_folder_of_runs_is_drawn_as_curves_named_by_what_differs(run
     assert left_out.startswith("dreamer_v3_circle_20260101-120000 left out: same settings and seed as ")
 
 
-def test_all_figures_refuse_if_none_can_be_drawn(tmp_path, recipe):
+def test_all_figures_refuse_if_none_can_be_drawn(tmp_path):
     write_run(tmp_path, "dreamer_v3_circle_seed0", returns=[float("nan")])
     with pytest.raises(ValueError, match=r"nothing could be drawn.*=learning_curves: no run has values of return"):
-        recipe.draw(recipe.PlotConfig(runs=str(tmp_path), output=str(tmp_path / "figures")))
+        draw(tmp_path, runs=str(tmp_path))
 
 
-def test_a_defect_costs_no_other_figure_and_is_no_secret(runs, recipe, monkeypatch):
+def test_a_defect_costs_no_other_figure_and_is_no_secret(runs, monkeypatch):
     def broken(*_: object) -> None:
         raise TypeError("not a figure")
 
-    monkeypatch.setitem(recipe.FIGURES, "learning_curves", recipe.Entry(broken, lambda config: ()))
+    monkeypatch.setitem(plotting.FIGURES, "learning_curves", plotting.Entry(broken, lambda config: ()))
     with pytest.raises(TypeError, match="not a figure"):
-        recipe.draw(recipe.PlotConfig(runs=str(runs / "runs"), output=str(runs / "figures")))
+        draw(runs)
     assert (runs / "figures" / "trajectories.png").exists()
 
 
-def test_a_figure_finds_the_columns_that_its_entry_names(runs, recipe, monkeypatch):
+def test_a_figure_finds_the_columns_that_its_entry_names(runs, monkeypatch):
     found = []
 
-    def draw(config, output: Path, read: list, problems: list[str]):
+    def draw_new(config, output: Path, read: list, problems: list[str]):
         found.extend(sorted(read[0].metrics.columns))
         return ["new.png"], []
 
-    monkeypatch.setitem(recipe.FIGURES, "new", recipe.Entry(draw, lambda config: ["evaluation/success_rate"]))
-    recipe.draw(recipe.PlotConfig(figure="new", runs=str(runs / "runs"), output=str(runs / "figures")))
+    monkeypatch.setitem(plotting.FIGURES, "new", plotting.Entry(draw_new, lambda config: ["evaluation/success_rate"]))
+    draw(runs, figure="new")
     assert found == ["evaluation/success_rate"]
 
 
-def test_figures_are_named_where_one_chooses_them(recipe):
+def test_figures_are_named_where_one_chooses_them():
     page, options = ((ROOT / "docs" / name).read_text(encoding="utf-8") for name in ("figures.md", "options.md"))
     (meaning,) = re.findall(r"^\| `figure=` .*$", options, re.M)
-    for name in (*recipe.FIGURES, "all"):
+    for name in (*plotting.FIGURES, "all"):
         assert f"\n| `{name}` |" in page and re.search(rf"\b{name}\b", meaning), name
 
 
@@ -262,9 +249,9 @@ def test_figures_of_an_experiment_do_not_depend_on_each_other(runs):
     assert (runs / "runs" / "figures" / "trajectories.png").exists()
 
 
-def test_a_comparison_names_what_was_left_out(runs, recipe, figures):
+def test_a_comparison_names_what_was_left_out(runs, figures):
     write_run(runs / "runs", "dreamer_v3_circle_seed0", returns=[1.0] * 40)
-    recipe.draw(recipe.PlotConfig(figure="comparison", runs=str(runs / "runs"), output=str(runs / "figures")))
+    output = draw(runs, figure="comparison")
     warning = "dreamer_v3_circle_paper_seed0 ends at 2,000 env_steps, but 32,000 to 40,000 are compared: left out"
-    assert f"- {warning}\n" in (runs / "figures" / "comparison.md").read_text()
-    assert warning in (runs / "figures" / "comparison_left_out.txt").read_text()
+    assert f"- {warning}\n" in (output / "comparison.md").read_text()
+    assert warning in (output / "comparison_left_out.txt").read_text()

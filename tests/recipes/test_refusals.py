@@ -8,27 +8,17 @@ from pathlib import Path
 import pytest
 from omegaconf import DictConfig, OmegaConf
 
-from tests.running_recipes import ROOT, build, compose, recipe, recipe_module
+from tests.running_recipes import ROOT, build, compose, recipe_module, refused
 
 
-@pytest.mark.parametrize(
-    ("overrides", "words"),
-    [
-        (["track=monza"], ["monza", "kidney"]),
-        (["run_dir=/dev/null/run"], ["/dev/null/run"]),
-        (["resume=/nowhere"], ["/nowhere"]),
-    ],
-    ids=lambda value: value[0] if isinstance(value, list) else None,
-)
-def test_a_person_gets_a_plain_error(overrides: list[str], words: list[str], tmp_path: Path) -> None:
-    done = recipe("dreamer_v3", "model=debug", *overrides, cwd=tmp_path)
-    assert done.returncode != 0
-    assert "Traceback" not in done.stderr
-    assert all(word in done.stderr for word in words), done.stderr
-    assert len(done.stderr.strip().splitlines()) <= 6
+def test_a_person_gets_a_plain_error(tmp_path: Path) -> None:
+    said = refused("dreamer_v3", "model=debug", "resume=/nowhere", cwd=tmp_path)
+    assert "/nowhere" in said and len(said.strip().splitlines()) <= 6
 
 
 REFUSED = [
+    (["track=monza"], ["monza", "kidney"]),
+    (["run_dir=/dev/null/run"], ["/dev/null/run"]),
     (["env.preset=esay"], ["env.preset=esay", "did you mean easy?", "faithful"]),
     (["env.renderer=directx", "env.from_pixels=true"], ["directx", "egl"]),
     (["device=cuda:7"], ["cuda:7", "cpu"]),
@@ -230,6 +220,7 @@ def test_deviations_that_fall_together_are_compared_by_their_clock() -> None:
         ("perception", ["checkpoint=nowhere", "episodes=0"]),
         ("perception", ["checkpoint=nowhere", "num_envs=-3"]),
         ("export", ["checkpoint=nowhere", "steps=0"]),
+        ("doctor", ["checkpoint.keep=0"]),
         ("plot", ["window=-1"]),
     ],
 )

@@ -45,18 +45,14 @@ def test_groups_are_the_recipes_own() -> None:
     assert options.groups("fly") == {}
 
 
-WITHOUT_WHAT_TAKES_TIME = """
-import sys
+FORGET = """
+import atexit, sys
 for name in [*sys.modules]:  # which begin with what a recipe needs
     if name.partition(".")[0] in ("torch", "torchrl", "tensordict", "hydra", "dreamer_racing"):
         del sys.modules[name]
-sys.modules["torch"] = sys.modules["hydra"] = None
 """
-WHAT_IS_LOADED = """
-import atexit, sys
-for name in [*sys.modules]:
-    if name.partition(".")[0] in ("torch", "torchrl", "tensordict", "hydra", "dreamer_racing"):
-        del sys.modules[name]
+WITHOUT_WHAT_TAKES_TIME = f'{FORGET}sys.modules["torch"] = sys.modules["hydra"] = None'
+WHAT_IS_LOADED = f"""{FORGET}
 atexit.register(lambda: print("loaded:", *(name for name in ("torch", "hydra") if name in sys.modules)))
 """
 
