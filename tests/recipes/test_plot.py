@@ -35,11 +35,11 @@ def runs(tmp_path: Path) -> Path:
     return tmp_path
 
 
-def draw(runs: Path, **settings: Any) -> Path:
-    """Draw figures of the runs, unless of others; return the folder that they are drawn to."""
-    config = plotting.PlotConfig(**{"runs": str(runs / "runs"), "output": str(runs / "figures")} | settings)
+def draw(folder: Path, **settings: Any) -> Path:
+    """Draw figures of a folder's runs, unless of others; return where they are."""
+    config = plotting.PlotConfig(**{"runs": str(folder / "runs"), "output": str(folder / "figures")} | settings)
     plotting.draw(config)
-    return runs / "figures"
+    return folder / "figures"
 
 
 def test_all_figures_and_the_curves_again_from_their_csv(runs):
