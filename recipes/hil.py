@@ -181,6 +181,7 @@ def replay(config: HilConfig) -> int:
     flight = Flight(Path(config.replay))
     try:
         flown = OmegaConf.to_object(OmegaConf.merge(OmegaConf.structured(HilConfig), flight.about["config"]))
+        track = flight.track()
     except (KeyError, TypeError, OmegaConfBaseException) as error:
         raise ValueError(
             f"replay={config.replay} was flown with settings that this version does not know "
@@ -188,9 +189,6 @@ def replay(config: HilConfig) -> int:
         ) from error
     settings = cast(HilConfig, flown)
     check_settings(settings)
-    if not flight.holds_track:
-        print("note: the recording does not contain its track; the current version of the track is used")
-    track = flight.track()
     flyer, _ = make_flyer(settings, track)
     settings.renderer = config.renderer
     with closing(make_chain(settings, flyer, track)) as chain:

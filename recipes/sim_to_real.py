@@ -98,8 +98,7 @@ def check(config: SimToRealConfig) -> tuple[Track, Callable[[], Flyer]]:
     path = existing_agent_path("actor", config.actor)
     contract = read_contract(path)
     track = load_track(config.track) if config.track else trained_track(contract)
-    if note := check_contract(contract, track):
-        print(f"note: {note}")
+    check_contract(contract, track)
     return track, partial(ActorFlyer, path)
 
 

@@ -120,8 +120,6 @@ def _make_report(flight: FlownFlight, passes: list[GatePass], response: dict[str
     config, ticks = flight.about.get("config") or {}, flight.time[flight.flown]
     began = float(ticks[0]) if len(ticks) else 0.0
     problems = [] if flight.whole else ["the file is incomplete: the loop was killed, or is still running"]
-    if not flight.holds_track:
-        problems.append(f"the recording does not contain its track: today's {flight.track.name} is used")
     counted = int(flight.passes.max())
     if counted != len(passes):
         problems.append(f"the loop counted {counted} gates, but the recorded poses give {len(passes)}")

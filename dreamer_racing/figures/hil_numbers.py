@@ -38,7 +38,6 @@ class FlownFlight:
     path: Path  # of the recording, or of its folder
     about: dict[str, Any]  # metadata from the recording
     whole: bool  # whether the recording is complete
-    holds_track: bool  # whether the recording holds the track; if not, `track` is today's of the recorded name
     track: Track
     limits: SafetyLimits  # only `LIMITS` are read from the recording
     time: np.ndarray  # (T,) start of each tick on the loop's clock, s
@@ -78,7 +77,7 @@ def read_flown(path: Path) -> FlownFlight:
 
     Raises:
         FileNotFoundError: The recording does not exist.
-        ValueError: The recording is damaged or empty, or its track does not exist.
+        ValueError: The recording, or the track in it, is damaged, or there are no ticks.
     """
     flight = Flight(path)
     if not flight.ticks:
@@ -97,9 +96,7 @@ def read_flown(path: Path) -> FlownFlight:
     except (KeyError, TypeError, IndexError, AttributeError, ValueError) as error:
         what = f"{type(error).__name__}: {error}"
         raise ValueError(f"{path}: its content is not what recipes/hil.py writes ({what}).") from error
-    return FlownFlight(
-        path, flight.about, flight.whole, flight.holds_track, track, limits, out_of_order=clock.out_of_order, **arrays
-    )
+    return FlownFlight(path, flight.about, flight.whole, track, limits, out_of_order=clock.out_of_order, **arrays)
 
 
 def latencies(flight: FlownFlight) -> dict[str, Any]:

@@ -283,18 +283,16 @@ def describe_inputs(inputs: Inputs) -> dict[str, Any]:
 
 
 def read_inputs(message: dict[str, Any]) -> Inputs:
-    """Return a tick's inputs from the values of `describe_inputs`; older recordings lack some."""
+    """Return a tick's inputs from the values of `describe_inputs`."""
     received = []
     for arrived, sequence, stamp, *numbers in message["received"]:
         values = np.array(numbers)
         packet = PosePacket(sequence, stamp, values[:3], values[3:7], values[7:10], values[10:])
         received.append(Received(arrived, packet))
-    voltages = [Reading(*reading) for reading in message.get("voltages", ())]
-    operator, dropped = Operator(*message["operator"]), message.get("dropped", False)
-    overrun = int(message["overrun"])  # older recordings hold a bool
+    operator, voltages = Operator(*message["operator"]), [Reading(*reading) for reading in message["voltages"]]
     imu = [ImuReading(arrived, np.array(sample)) for arrived, *sample in message.get("imu", ())]
-    refusal = message.get("refusal", "")
-    return Inputs(message["time"], received, operator, overrun, voltages, dropped, imu, refusal)
+    rest = message["overrun"], voltages, message["dropped"], imu, message.get("refusal", "")
+    return Inputs(message["time"], received, operator, *rest)
 
 
 def describe_outputs(outputs: Outputs) -> dict[str, Any]:

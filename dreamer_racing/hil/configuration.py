@@ -215,14 +215,14 @@ def check_flight(config: HilConfig, contract: dict[str, Any], track: Track) -> l
         ValueError: Something does not match; the message names it, with a line per setting of the flight controller.
         OSError: The dump's file does not exist.
     """
-    found: list[str | None] = []
+    loop: str | None = None
     if config.actor not in (PILOT, IDENTIFY):
-        found.append(check_contract(contract, track, config.rate))
+        check_contract(contract, track, config.rate)
         if config.vehicle is not None:
-            found.append(check_rate_loop(contract, config.vehicle, config.force))
+            loop = check_rate_loop(contract, config.vehicle, config.force)
         elif config.arm and config.link in BETAFLIGHT:
-            found.append(check_flown_by_betaflight(contract, config.link, config.force))
-    notes = [note for note in found if note is not None]
+            loop = check_flown_by_betaflight(contract, config.link, config.force)
+    notes = [] if loop is None else [loop]
     notes += check_ranges(contract, limits_of(config, track), given_limits(config))
     if config.betaflight_dump is not None:
         if config.link not in BETAFLIGHT:

@@ -83,27 +83,22 @@ def trained_track(contract: dict[str, Any]) -> Track:
     return read_track(described, "the contract's source.track_description")
 
 
-def check_contract(contract: dict[str, Any], track: Track, rate: float | None = None) -> str | None:
+def check_contract(contract: dict[str, Any], track: Track, rate: float | None = None) -> None:
     """Refuse an actor that was trained for another track, rate (Hz; None: its own) or image size.
 
     The track's geometry must be that of the contract, its name may differ.
-
-    Returns:
-        What was not compared, because an older contract lacks it, in words; None if everything was.
 
     Raises:
         ValueError: The message names the fields that differ, with both values.
     """
     differing = []
-    source, own_rate = contract.get("source", {}), contract["control"]["rate_hz"]
-    trained, geometry, found = source.get("track"), source.get("track_sha256"), hash_track(track)
-    if geometry is not None and geometry != found:
+    source, own_rate = contract["source"], contract["control"]["rate_hz"]
+    geometry, found = source.get("track_sha256"), hash_track(track)
+    if geometry != found:
         differing.append(
-            f"source.track is {trained!r}, whose gates, start and bounds have the hash {str(geometry)[:12]} "
-            f"(source.track_sha256), but those of track={track.name} have {found[:12]}"
+            f"source.track is {source.get('track')!r}, whose gates, start and bounds have the hash "
+            f"{str(geometry)[:12]} (source.track_sha256), but those of track={track.name} have {found[:12]}"
         )
-    elif geometry is None and trained is not None and Path(str(trained)).stem != track.name:
-        differing.append(f"source.track is {trained!r}, but track={track.name}")
     if rate is not None and abs(rate - own_rate) > 1e-6:
         differing.append(f"control.rate_hz is {own_rate:g}, but rate={rate:g}")
     image = contract["inputs"][0]
@@ -113,9 +108,6 @@ def check_contract(contract: dict[str, Any], track: Track, rate: float | None = 
             differing.append(f"camera gives images of {described}, but the input {image['name']} is {image['shape']}")
     if differing:
         raise ValueError(f"The actor's contract does not fit: {'; '.join(differing)}.")
-    if geometry is None:
-        return f"the contract has no source.track_sha256: {track.name} was compared by its name only, not by its gates"
-    return None
 
 
 def check_rate_loop(contract: dict[str, Any], vehicle: str, force: bool) -> str | None:

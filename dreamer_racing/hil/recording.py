@@ -18,7 +18,7 @@ from typing import Any, Self
 import numpy as np
 
 from dreamer_racing.commands import import_extra
-from dreamer_racing.envs.tracks import Track, load_track, read_track
+from dreamer_racing.envs.tracks import Track, read_track
 from dreamer_racing.hil.background_worker import BackgroundWorker
 
 FLIGHT, TICK = "/flight", "/tick"
@@ -114,7 +114,6 @@ class Flight:
     Attributes:
         about: The values that describe it.
         ticks: The messages of its ticks.
-        holds_track: Whether the file contains the track; older recordings do not.
         whole: Whether the file was finished; if not, the loop was killed.
 
     Raises:
@@ -133,20 +132,16 @@ class Flight:
         if (version := self.about.get("format_version")) != FORMAT_VERSION:
             raise ValueError(f"{path}: a flight of version {version!r}; this release reads version {FORMAT_VERSION}.")
         self.ticks = [message for topic, message in messages if topic == TICK]
-        self.holds_track = TRACK in self.about
         self._path = path
 
     def track(self) -> Track:
-        """Return the track that was flown; if the file lacks it, the present track of its name.
+        """Return the track that was flown.
 
         Raises:
-            TrackError: The recorded track is damaged, or there is no such track any more.
-            KeyError: The file names no track.
+            TrackError: The recorded track is damaged.
+            KeyError: The file holds no track.
         """
-        if self.holds_track:
-            return read_track(self.about[TRACK], f"{self._path}: {TRACK}")
-        config = self.about.get("config") or {}
-        return load_track(config.get("track") or self.about["track"])
+        return read_track(self.about[TRACK], f"{self._path}: {TRACK}")
 
     def _read(self, path: Path) -> Iterator[tuple[str, dict[str, Any]]]:
         reader, exceptions = _import_mcap("stream_reader"), _import_mcap("exceptions")

@@ -37,6 +37,9 @@ PERIOD, SENT, AGE, WIRE, LAG = 0.02, 0.004, 0.005, 0.003, 0.06  # s
 ACCUSTOMED = {"start_box": 0.6, "start_yaw_tolerance_degrees": 45.0}
 
 
+ABOUT = {"track": "circle", TRACK: describe_track(CIRCLE)}
+
+
 def gate_time(number: int) -> float:
     """When it passes its gate of that number, counted on over laps, from 0."""
     return OFF + (0.5 * math.pi * number - ANGLE) / SPIN
@@ -65,7 +68,7 @@ class Flown:
     stamping: Stamping = Stamping.receive
     offset: float = 0.0  # s, of the sender's clock
     kill_at: float = math.inf
-    about: dict[str, Any] = field(default_factory=lambda: {"track": "circle", TRACK: describe_track(CIRCLE)})
+    about: dict[str, Any] = field(default_factory=lambda: ABOUT)
     sent: list[tuple[float, np.ndarray]] = field(default_factory=list)
 
     def fly(self, ticks: int = 600) -> Path:
@@ -143,14 +146,10 @@ def report(flown) -> dict[str, Any]:
 
 
 def test_a_report_is_of_the_track_that_was_flown(tmp_path, unseen):
-    """Its name is that of another now; without the track in the file, as in old ones, the report says what it took."""
-    for name, kept in (("kept", {TRACK: describe_track(CIRCLE)}), ("old", {})):
-        Flown(tmp_path / name, about={"track": "kidney", **kept}).fly()
-        write_report(tmp_path / name)
-    kept, old = (reported(tmp_path / name) for name in ("kept", "old"))
-    assert kept["track"] == "circle" and len(kept["gates"]) == 8 and kept["problems"] == []
-    assert old["track"] == "kidney" and len(old["gates"]) != 8
-    assert "the recording does not contain its track: today's kidney is used" in old["problems"]
+    """Its name is that of another now."""
+    write_report(Flown(tmp_path, about={"track": "kidney", TRACK: describe_track(CIRCLE)}).fly())
+    report = reported(tmp_path)
+    assert report["track"] == "circle" and len(report["gates"]) == 8 and report["problems"] == []
 
 
 def test_a_track_that_is_damaged_in_the_recording_is_refused(tmp_path):
@@ -305,7 +304,7 @@ def test_flights_of_a_few_ticks(tmp_path, ticks):
 
 def test_a_flight_without_poses_and_one_without_ticks(tmp_path):
     chain = FlightChain(Wobble(), CIRCLE, ChainConfig(SafetyLimits.of_track(CIRCLE)))
-    with FlightRecorder(tmp_path / FILE, {"track": "circle"}) as recorder:
+    with FlightRecorder(tmp_path / FILE, ABOUT) as recorder:
         for index in range(5):
             inputs = Inputs(PERIOD * index, [], Operator(False, False), False)
             took = dict.fromkeys(("jitter", "render", "act", "sent"), 0.0)
@@ -323,11 +322,11 @@ def test_a_flight_without_poses_and_one_without_ticks(tmp_path):
     ("about", "tick"),
     [
         ({}, {}),
-        ({"track": "circle"}, {"in": 1}),
-        ({"track": "circle"}, {"in": {"time": 0.0}, "out": {}, "took": {}}),
-        ({"track": "circle", "config": [1]}, {}),
-        ({"track": "circle", "config": {"stamping": "never"}}, {}),
-        ({"track": "circle"}, None),
+        (ABOUT, {"in": 1}),
+        (ABOUT, {"in": {"time": 0.0}, "out": {}, "took": {}}),
+        ({**ABOUT, "config": [1]}, {}),
+        ({**ABOUT, "config": {"stamping": "never"}}, {}),
+        (ABOUT, None),
     ],
 )
 def test_other_content_is_refused(tmp_path, about, tick):
@@ -337,18 +336,14 @@ def test_other_content_is_refused(tmp_path, about, tick):
         write_report(tmp_path)
 
 
-def test_times_out_of_order_and_an_unknown_track_are_refused(tmp_path, flown):
+def test_times_out_of_order_are_refused(tmp_path, flown):
     flight = read_flown(flown)
     assert (np.diff(flight.time) > 0).all()
-    with FlightRecorder(tmp_path / FILE, {"track": "circle"}) as recorder:
+    with FlightRecorder(tmp_path / FILE, ABOUT) as recorder:
         for tick in reversed(Flight(flown).ticks[:3]):
             recorder.tick(0.0, tick)
     with pytest.raises(ValueError, match="times of ticks are not finite, or not in order"):
         write_report(tmp_path)
-    with FlightRecorder(tmp_path / "unknown" / FILE, {"track": "nowhere"}) as recorder:
-        recorder.tick(0.0, Flight(flown).ticks[0])
-    with pytest.raises(ValueError, match="nowhere"):
-        write_report(tmp_path / "unknown")
 
 
 def test_a_flight_whose_loop_was_killed_or_that_is_damaged(tmp_path, flown, unseen):
