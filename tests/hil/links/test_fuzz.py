@@ -10,8 +10,10 @@ from collections.abc import Iterator
 import numpy as np
 import pytest
 
+from dreamer_racing.hil.imu import decode_imu, encode_imu
 from dreamer_racing.hil.links.udp import CommandPacket, encode_command
-from dreamer_racing.hil.pose import PosePacket, UdpPose, encode_pose
+from dreamer_racing.hil.operator import Operator, decode_operator, encode_operator
+from dreamer_racing.hil.pose import PosePacket, UdpPose, decode_pose, encode_pose
 from dreamer_racing.hil.stamping import PoseClock, Stamping
 from dreamer_racing.hil.vehicle import Command, Setpoint
 from dreamer_racing.plant.commands import CommandReceiver
@@ -70,10 +72,29 @@ def random() -> np.random.Generator:
     return np.random.default_rng(0)
 
 
+LEVEL, ZERO = np.array([1.0, 0.0, 0.0, 0.0]), np.zeros(3)
+
+
+@pytest.mark.parametrize(
+    ("valid", "decode"),
+    [
+        (encode_pose(PosePacket(7, 12.5, ZERO, LEVEL, ZERO, ZERO)), decode_pose),
+        (encode_operator(1, Operator(False, False)), decode_operator),
+        (encode_imu(3, 1.5, np.ones(6)), decode_imu),
+    ],
+    ids=["pose", "operator", "imu"],
+)
+def test_a_hundred_thousand_packets_with_a_wrong_byte(valid, decode, random) -> None:
+    assert decode(valid) is not None
+    packets = np.tile(np.frombuffer(valid, np.uint8), (100_000, 1))
+    places, wrong = random.integers(0, len(valid), 100_000), random.integers(1, 256, 100_000, dtype=np.uint8)
+    packets[np.arange(100_000), places] ^= wrong
+    assert not any(decode(packet.tobytes()) is not None for packet in packets)
+
+
 def test_poses(random: np.random.Generator) -> None:
     """Through the socket and onto the loop's clock, as a flight has them."""
-    level, zero = np.array([1.0, 0.0, 0.0, 0.0]), np.zeros(3)
-    valid = [encode_pose(PosePacket(7 + n, 0.005 * n, random.normal(size=3), level, zero, zero)) for n in range(100)]
+    valid = [encode_pose(PosePacket(7 + n, 0.005 * n, random.normal(size=3), LEVEL, ZERO, ZERO)) for n in range(100)]
     poses, clock = UdpPose(0), PoseClock(Stamping.receive, 0.0)
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sender:
 
