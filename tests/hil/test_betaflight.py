@@ -134,22 +134,27 @@ def test_a_difference_is_said_with_what_was_found_and_what_is_wanted(contract):
 
 
 @pytest.mark.parametrize(
-    ("aux", "status"),
+    ("name", "aux", "status"),
     [
-        (["aux 0 0 0 1700 2100 0 0"], Status.OK),
-        (["aux 0 0 0 1700 2100 0"], Status.OK),  # before linked modes
-        (["aux 3 0 0 1700 2100 0 0", "aux 4 0 0 900 900 0 0"], Status.OK),  # an empty slot
-        ([], Status.DIFFERS),
-        (["aux 0 0 0 900 900 0 0"], Status.DIFFERS),
-        (["aux 0 0 1 1700 2100 0 0"], Status.DIFFERS),
-        (["aux 0 0 0 900 2100 0 0"], Status.DIFFERS),
-        (["aux 0 0 0 1700 2100 0 0", "aux 1 0 3 1700 2100 0 0"], Status.DIFFERS),
-        (["aux 0 1 0 1700 2100 0 0"], Status.DIFFERS),
+        ("ARM", ["aux 0 0 0 1700 2100 0 0"], Status.OK),  # only AUX1 may arm
+        ("ARM", ["aux 0 0 0 1700 2100 0"], Status.OK),  # before linked modes
+        ("ARM", ["aux 3 0 0 1700 2100 0 0", "aux 4 0 0 900 900 0 0"], Status.OK),  # an empty slot
+        ("ARM", [], Status.DIFFERS),
+        ("ARM", ["aux 0 0 0 900 900 0 0"], Status.DIFFERS),
+        ("ARM", ["aux 0 0 1 1700 2100 0 0"], Status.DIFFERS),
+        ("ARM", ["aux 0 0 0 900 2100 0 0"], Status.DIFFERS),
+        ("ARM", ["aux 0 0 0 1700 2100 0 0", "aux 1 0 3 1700 2100 0 0"], Status.DIFFERS),
+        ("ARM", ["aux 0 1 0 1700 2100 0 0"], Status.DIFFERS),
+        ("levelling", ["aux 1 1 1 1700 2100 0 0"], Status.OK),  # ANGLE on AUX2, which stays at 1000 µs
+        ("levelling", ["aux 1 1 1 900 1300 0 0"], Status.DIFFERS),
+        ("levelling", ["aux 1 2 5 900 1300 0 0"], Status.DIFFERS),
+        ("levelling", ["aux 1 1 0 1700 2100 0 0"], Status.DIFFERS),  # on whenever it is armed
+        ("levelling", ["aux 1 13 1 900 1300 0 0"], Status.OK),  # BEEPER
     ],
 )
-def test_only_aux1_arms(contract, aux, status):
+def test_only_aux1_arms_and_sticks_must_not_mean_angles(contract, name, aux, status):
     lines = [line for line in print_settings(contract, "crsf") if not line.startswith("aux")]
-    assert statuses(dump_of(lines + aux), contract)["ARM"] is status
+    assert statuses(dump_of(lines + aux), contract)[name] is status
 
 
 @pytest.mark.parametrize(
@@ -172,20 +177,6 @@ def test_beside_a_receiver_msp_says_the_sticks_and_nothing_that_arms(contract):
     wanted = {each.name: each.value for each in wanted_settings(contract, "msp_override")}
     assert int(wanted["msp_override_channels_mask"]) == 0b1111
     assert wanted["msp_override_failsafe"] == "OFF" and "serialrx_provider" not in wanted
-
-
-@pytest.mark.parametrize(
-    ("aux", "status"),
-    [
-        ("aux 1 1 1 1700 2100 0 0", Status.OK),  # ANGLE on AUX2, which stays at 1000 µs
-        ("aux 1 1 1 900 1300 0 0", Status.DIFFERS),
-        ("aux 1 2 5 900 1300 0 0", Status.DIFFERS),
-        ("aux 1 1 0 1700 2100 0 0", Status.DIFFERS),  # on whenever it is armed
-        ("aux 1 13 1 900 1300 0 0", Status.OK),  # BEEPER
-    ],
-)
-def test_sticks_must_not_mean_angles(contract, aux, status):
-    assert statuses(dump_of([*print_settings(contract, "crsf"), aux]), contract)["levelling"] is status
 
 
 def test_the_selected_profiles_count(contract):
