@@ -47,6 +47,15 @@ def clock() -> Clock:
 
 
 @pytest.fixture
+def listener() -> Iterator[socket.socket]:
+    """A free UDP port of this machine."""
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as listening:
+        listening.bind(("127.0.0.1", 0))
+        listening.settimeout(5.0)
+        yield listening
+
+
+@pytest.fixture
 def wire() -> Iterator[tuple[int, str]]:
     """The far end of a serial line, and the path of the near one."""
     far, near = os.openpty()

@@ -121,12 +121,10 @@ def test_msp_asks_with_the_first_command_and_every_fifth():
 class Autopilot:
     """Sends MAVLink to a link over loopback."""
 
-    def __init__(self) -> None:
+    def __init__(self, listener: socket.socket) -> None:
         self.common = pytest.importorskip("pymavlink.dialects.v20.common")
-        self.socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
-        self.socket.bind(("127.0.0.1", 0))
-        self.socket.settimeout(5.0)
-        self.link = make_link(LinkConfig("mavlink", port=self.socket.getsockname()[1], thrust=THRUST))
+        self.socket = listener
+        self.link = make_link(LinkConfig("mavlink", port=listener.getsockname()[1], thrust=THRUST))
         self.link.send(at_rest())
         self.address = self.socket.recvfrom(2048)[1]
 
@@ -146,11 +144,10 @@ class Autopilot:
 
 
 @pytest.fixture
-def autopilot():
-    pilot = Autopilot()
+def autopilot(listener):
+    pilot = Autopilot(listener)
     yield pilot
     pilot.link.close()
-    pilot.socket.close()
 
 
 def test_mavlink_over_loopback(autopilot):
@@ -198,11 +195,9 @@ def test_strangers_are_not_heard(autopilot):
     assert autopilot.link.listen() == []
 
 
-def test_nobody_there_is_still_counted_when_it_was_reading_that_found_out():
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as gone:
-        gone.bind(("127.0.0.1", 0))
-        address = gone.getsockname()
-    transport = UdpTransport(*address)
+def test_nobody_there_is_still_counted_when_it_was_reading_that_found_out(listener):
+    transport = UdpTransport(*listener.getsockname())
+    listener.close()
     assert transport.write(b"one")
     assert list(transport.read()) == []
     assert not transport.write(b"two")
@@ -269,28 +264,20 @@ def test_a_packet_of_the_plant_and_what_is_none() -> None:
     packet = encode_imu(3, 1.5, sample)
     decoded = decode_imu(packet)
     assert len(packet) == 68 and decoded is not None and decoded.tolist() == sample.tolist()
-    for broken in (
-        packet[:-1],
-        b"DRX1" + packet[4:],
-        packet[:20] + b"\x01" + packet[21:],
-        encode_imu(0, 0.0, sample * 1e6),
-    ):
+    for broken in (packet[:-1], encode_imu(0, 0.0, sample * 1e6)):  # those with a wrong byte are in `test_fuzz`
         assert decode_imu(broken) is None
     telemetry = PacketTelemetry()
     assert telemetry.read(packet) == telemetry.read(b"") == []
     assert (len(telemetry.imu_samples), telemetry.rejected) == (1, 1)
 
 
-def test_a_link_gives_samples_once_with_their_time_of_arrival() -> None:
-    vehicle = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
-    vehicle.bind(("127.0.0.1", 0))
-    vehicle.settimeout(5.0)
-    link = UdpLink("127.0.0.1", vehicle.getsockname()[1], imu=True)
+def test_a_link_gives_samples_once_with_their_time_of_arrival(listener: socket.socket) -> None:
+    link = UdpLink(*listener.getsockname(), imu=True)
     link.send(at_rest())
-    address = vehicle.recvfrom(100)[1]
+    address = listener.recvfrom(100)[1]
     sample = np.array((*TURNING, *FORCE))
     for _ in range(2):
-        vehicle.sendto(encode_imu(0, 0.0, sample), address)
+        listener.sendto(encode_imu(0, 0.0, sample), address)
     assert link.read_imu() == [], "before it has listened"
     assert link.listen() == []
     samples = link.read_imu()
@@ -298,7 +285,6 @@ def test_a_link_gives_samples_once_with_their_time_of_arrival() -> None:
     assert samples[0].time <= samples[1].time
     assert link.read_imu() == []
     link.close()
-    vehicle.close()
 
 
 @pytest.mark.parametrize("name", ["crsf", "sbus"])
