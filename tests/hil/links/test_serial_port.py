@@ -170,12 +170,21 @@ def test_a_device_that_is_pulled_out():
     os.close(far)
     with pytest.raises(OSError, match=f"device={path}: it is gone: Input/output error"):
         transport.write(b"frame")
+    with pytest.raises(OSError, match=f"device={path}: it is gone"):
+        next(transport.read())
     transport.close()
 
 
-def test_no_such_device():
-    with pytest.raises(OSError, match="device=/dev/no_radio: there is no such device. Is it plugged in"):
-        SerialPort("/dev/no_radio", MSP)
+@pytest.mark.parametrize(
+    ("device", "remedy"),
+    [
+        ("/dev/no_radio", "there is no such device. Is it plugged in"),
+        ("/dev/null", "Could not configure port"),  # no serial port
+    ],
+)
+def test_devices_that_are_none(device, remedy):
+    with pytest.raises(OSError, match=f"device={device}: {remedy}"):
+        SerialPort(device, MSP)
 
 
 def test_a_device_of_another_user(monkeypatch):
@@ -194,11 +203,6 @@ def test_a_device_in_use(wire):
     with pytest.raises(OSError, match=f"device={wire[1]}: another program uses it"):
         SerialPort(wire[1], MSP)
     first.close()
-
-
-def test_no_serial_port():
-    with pytest.raises(OSError, match="device=/dev/null: Could not configure port"):
-        SerialPort("/dev/null", MSP)
 
 
 def test_no_such_rate(wire):
