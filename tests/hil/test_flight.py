@@ -165,13 +165,6 @@ def test_the_battery_is_heard_in_flight_reckoned_with_and_played_back(tmp_path):
     assert first_difference(chain(), ticks).startswith("tick 7: voltage was "), "bit for bit"
 
 
-def test_nothing_is_armed_without_leave():
-    plant = Watched(CIRCLE)
-    ended = plant.fly(chain_of(Hover(), plant, arm=False), Hover.rate, 2.0)
-    assert ended.startswith("2 s are over; not armed:") and "arm=true" in ended
-    assert not any(command.armed for _, command in plant.sent)
-
-
 @pytest.mark.parametrize("phase", [0.005, 0.035])
 def test_poses_are_lost_to_cut_within_200_ms_at_25_hz_by_an_actor_that_takes_30_ms(phase):
     """Whenever in a tick the last one was measured; what is cut does not wait for the actor."""
@@ -367,46 +360,27 @@ def test_a_disk_that_is_full_does_not_end_a_flight():
     assert max(moment for moment, command in plant.sent if command.armed) > 2.4
 
 
-def test_a_link_that_breaks_in_flight_cuts_and_the_flight_ends_as_any_other(caplog):
-    """As where an adapter is unplugged: sending and listening fail from then on."""
-
-    class Unplugged(Watched):
-        def send(self, command: Command) -> bytes:
-            if self.elapsed > 2.0:
-                raise OSError(19, "No such device")
-            return super().send(command)
-
-        def listen(self) -> list:
-            if self.elapsed > 2.0:
-                raise OSError(19, "No such device")
-            return super().listen()
-
-    plant = Unplugged(CIRCLE)
-    chain = chain_of(Hover(), plant)
-    assert plant.fly(chain, Hover.rate, 30.0).startswith("cut: the link has accepted no command for 0.1")
-    assert chain.safety.state is State.CUT
-    assert sum("the link fails" in line for line in caplog.messages) == 1
-
-
 @pytest.mark.parametrize(
     ("part", "said", "states", "words"),
     [
         ("poses", "the source of poses fails", ["flying", "hold", "cut"], "cut: the newest pose is "),
         ("operator", "the operator's switch fails", ["flying", "cut"], "cut: the operator does not give the enable"),
+        ("link", "the link fails", ["flying", "cut"], "cut: the link has accepted no command for 0.1"),
     ],
 )
 def test_what_speaks_to_the_loop_and_breaks_in_flight_ends_it_as_any_other(part, said, states, words, tmp_path, caplog):
     """As where a receiver is unplugged: safety decides, all is recorded, and the reason is returned."""
     plant = Watched(CIRCLE)
-    source = getattr(plant, part)
-    poll = source.poll
+    broken, methods = (plant, ("send", "listen")) if part == "link" else (getattr(plant, part), ("poll",))
+    for name in methods:
+        works = getattr(broken, name)
 
-    def unplugged(*armed):
-        if plant.elapsed > 2.0:
-            raise OSError(19, "No such device")
-        return poll(*armed)
+        def unplugged(*arguments, works=works):
+            if plant.elapsed > 2.0:
+                raise OSError(19, "No such device")
+            return works(*arguments)
 
-    source.poll = unplugged
+        setattr(broken, name, unplugged)
     with FlightRecorder(tmp_path / FILE, {}) as recorder:
         ended = plant.fly(chain_of(Hover(), plant), Hover.rate, 30.0, recorder)
     assert ended.startswith(words)
@@ -508,26 +482,26 @@ class Scripted:
 
 
 @pytest.mark.parametrize(
-    ("poses", "left"),
-    [([(RISES, 0.0, 0.011)] * 4, True), ([(RISES, 0.0, 0.011)] * 2, False), ([(RISES, 0.0, 0.009)] * 9, False),
-     ([(RISES, 0.0, 0.02)] * 2 + [(SLOW, 0.0, 0.02)] + [(RISES, 0.0, 0.02)] * 2, False),
-     ([(SLOW, 2.1, 0.02)] * 9, False), ([(SINKS, 9.0, 0.02)] * 2, False)],
-)  # fmt: skip
-def test_a_flyer_takes_over_from_a_lift_when_poses_have_risen_for_long_enough(poses, left):
-    flight = Scripted(LIFT)
+    ("lift", "poses", "left"),
+    [
+        (LIFT, [(RISES, 0.0, 0.011)] * 4, True),
+        (LIFT, [(RISES, 0.0, 0.011)] * 2, False),
+        (LIFT, [(RISES, 0.0, 0.009)] * 9, False),
+        (LIFT, [(RISES, 0.0, 0.02)] * 2 + [(SLOW, 0.0, 0.02)] + [(RISES, 0.0, 0.02)] * 2, False),
+        (LIFT, [(SLOW, 2.1, 0.02)] * 9, False),
+        (LIFT, [(SINKS, 9.0, 0.02)] * 2, False),
+        (0.0, [(RISES, 0.0, 0.0)], True),
+        (0.0, [(SLOW, 1.9, 0.0)], False),
+        (0.0, [(SLOW, 2.1, 0.0)], True),
+        (0.0, [(SINKS, 0.0, 0.0)], True),
+    ],
+)
+def test_a_flyer_takes_over_when_poses_have_risen_for_long_enough_or_without_a_lift_moved(lift, poses, left):
+    flight = Scripted(lift)
     for _ in range(3):
         flight.tick()
     for velocity, rate, height in poses:
         flight.tick(velocity, rate, height)
-    assert flight.chain._flying is left
-
-
-@pytest.mark.parametrize(
-    ("velocity", "rate", "left"), [(RISES, 0.0, True), (SLOW, 1.9, False), (SLOW, 2.1, True), (SINKS, 0.0, True)]
-)
-def test_what_counts_as_having_left_the_start_without_a_lift(velocity, rate, left):
-    flight = Scripted(0.0)
-    flight.tick(velocity, rate)
     assert flight.chain._flying is left
 
 
@@ -589,17 +563,18 @@ def test_a_lift_that_no_pose_shows_ends_low(hidden, thrust, low, high):
     assert low < max(heights) - heights[0] < high
 
 
-@pytest.mark.parametrize(("lift", "limits"), [(1.05, {}), (-1.0, {}), (1.6, {}), (1.4, {"thrust_max": 13.0})])
-def test_a_lift_that_lifts_nothing_or_is_clipped_is_refused(lift, limits):
-    config = ChainConfig(SafetyLimits.of_track(CIRCLE, **limits), lift=lift)
-    with pytest.raises(ValueError, match=rf"lift={lift:g}: must be 1.1 to 1.5 times the weight.*limits.thrust_max="):
+@pytest.mark.parametrize(
+    ("field", "value", "limits", "allowed"),
+    [
+        *(("lift", lift, {}, "1.1 to 1.5 times the weight.*limits.thrust_max=") for lift in (1.05, -1, 1.6)),
+        ("lift", 1.4, {"thrust_max": 13.0}, "1.1 to 1.5 times the weight.*limits.thrust_max="),  # it would be clipped
+        *(("latency", latency, {}, "(a number, )?at least 0 and at most 1") for latency in (-1, 1.5, np.nan, "0")),
+    ],
+)
+def test_a_lift_and_a_latency_out_of_range_are_refused(field, value, limits, allowed):
+    config = ChainConfig(SafetyLimits.of_track(CIRCLE, **limits))._replace(**{field: value})
+    with pytest.raises(ValueError, match=f"{field}={value!r}: must be {allowed}"):
         FlightChain(Hover(), CIRCLE, config)
-
-
-@pytest.mark.parametrize("latency", [-1, 1.5, np.nan, "0"])
-def test_a_latency_that_is_no_time_is_refused(latency):
-    with pytest.raises(ValueError, match=f"latency={latency!r}: must be (a number, )?at least 0 and at most 1"):
-        FlightChain(Hover(), CIRCLE, ChainConfig(SafetyLimits.of_track(CIRCLE), latency=latency))
 
 
 @pytest.mark.parametrize("name", ["figure8", "kidney"])
