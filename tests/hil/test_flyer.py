@@ -202,27 +202,23 @@ def test_order_of_channels():
     assert values == (2000, 1000, 2000, 1250, 2000, *[1000] * 11)
 
 
-@pytest.mark.parametrize(("field", "value"), [("roll", 0.0), ("pitch", math.nan), ("yaw", 573.0)])
-def test_rates_that_are_none(field, value):
-    """573 is 10 rad/s, in deg/s."""
-    with pytest.raises(ValueError, match=f"RateMap.{field}="):
-        replace(RATES, **{field: value})
-
-
 @pytest.mark.parametrize(
-    ("changes", "message"),
+    ("right", "changes", "message"),
     [
-        ({"mass": 0.0}, "ThrustMap.mass=0.0: must be above 0"),
-        ({"mass": 600.0}, "ThrustMap.full_thrust=16.0 N: must lift mass=600.0 kg"),
-        ({"full_thrust": 4.0}, "ThrustMap.full_thrust=4.0 N: .* all motors together"),
-        ({"voltage": 3.75}, "ThrustMap.voltage=3.75 V: must be between 7.5 and 22.5 V"),
-        ({"idle": 5.5}, "ThrustMap.idle=5.5: must be at least 0 and at most 0.2"),
-        ({"min_check": 50.0}, "ThrustMap.min_check=50.0: must be at least 1000"),
+        (RATES, {"roll": 0.0}, "RateMap.roll="),
+        (RATES, {"pitch": math.nan}, "RateMap.pitch="),
+        (RATES, {"yaw": 573.0}, "RateMap.yaw="),  # 10 rad/s, in deg/s
+        (THRUST, {"mass": 0.0}, "ThrustMap.mass=0.0: must be above 0"),
+        (THRUST, {"mass": 600.0}, "ThrustMap.full_thrust=16.0 N: must lift mass=600.0 kg"),
+        (THRUST, {"full_thrust": 4.0}, "ThrustMap.full_thrust=4.0 N: .* all motors together"),
+        (THRUST, {"voltage": 3.75}, "ThrustMap.voltage=3.75 V: must be between 7.5 and 22.5 V"),
+        (THRUST, {"idle": 5.5}, "ThrustMap.idle=5.5: must be at least 0 and at most 0.2"),
+        (THRUST, {"min_check": 50.0}, "ThrustMap.min_check=50.0: must be at least 1000"),
     ],
 )
-def test_drones_that_are_none(changes, message):
+def test_drones_that_are_none(right, changes, message):
     with pytest.raises(ValueError, match=message):
-        replace(THRUST, **changes)
+        replace(right, **changes)
 
 
 # Flights of flyers that need what the IMU tells: told, played back, and cut where it is told no longer.
