@@ -25,7 +25,7 @@ FLIGHT, TICK = "/flight", "/tick"
 FILE = "flight.mcap"
 TRACK = "track_as_flown"
 """Key in the ``/flight`` message of the content of the track's file, as `describe_track` writes it."""
-FORMAT_VERSION = 1
+FORMAT_VERSION = 2
 
 WAITING_MOST = 256  # ticks that may wait for the disk [choice]: 5 s at 50 Hz, of some kilobytes each
 CLOSING = 10.0  # s for which `FlightRecorder.close` waits for the disk [choice]

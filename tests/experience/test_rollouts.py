@@ -136,7 +136,7 @@ def episodes(gates: list[int], targets: list[int], crashes: list[int]) -> Tensor
     [
         (([3], [0], [1]), [0.0, 1.0, 1.0], 0),  # from gate 0 on: 0 does not count, 1 and 2 are passed, crash before 0
         # also a crash before the first gate, and time that ran out after it
-        (([3, 0, 1], [0, 0, 1], [1, 1, 0]), [0.0, 1.0, 1.0], 0),
+        (([3, 0, 1], [0, 1, 1], [1, 1, 0]), [0.0, 1.0, 1.0], 0),
         (([7, 1, 1], [2, 1, 1], [0, 2, 3]), [1.0, 2 / 4, 1.0], 1),  # 1, then 2 0 1 2 0 1; twice 0 and a crash at 1
     ],
 )
@@ -145,6 +145,8 @@ def test_an_episode_counts_each_pass_and_crash_after_its_first_gate(ended, share
     assert passes.share == passes.update(episodes([], [], []), 0) == 0.0
     assert passes.update(episodes(*ended), 0) == passes.share == min(shares)
     assert passes.shares.tolist() == shares and passes.lowest_rate_gate == lowest
+    passes.update(episodes([], [], []), 0)
+    assert passes.shares.tolist() == shares
 
 
 def test_where_there_are_no_gates_the_share_stays_0():

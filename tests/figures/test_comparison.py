@@ -109,6 +109,8 @@ def test_variants_are_compared_at_equal_cpu_time() -> None:
 def test_nothing_to_compare_is_refused() -> None:
     with pytest.raises(ValueError, match="no run to compare"):
         compare_variants([])
+    with pytest.raises(ValueError, match="axis=minutes: must be one of"):
+        compare_variants(RUNS, axis="minutes")
 
 
 # The picture of a study, and the study itself on one flight.

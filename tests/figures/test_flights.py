@@ -67,7 +67,11 @@ def level_flight(position: torch.Tensor, **fields: object) -> Trajectory:
 EDITED = replace(load_track("circle"), name="kidney", laps=2)  # called as another, as an edited copy may be
 
 
-@pytest.mark.parametrize(("outcome", "course"), [("ground", "figure8_decoys"), ("finished", EDITED), (None, "split_s")])
+@pytest.mark.parametrize(
+    ("outcome", "course"),
+    [("ground", "figure8_decoys"), ("finished", EDITED), (None, "split_s")],
+    ids=["crashed", "of an edited track", "cut off"],
+)
 def test_a_flight_comes_back_exactly(tmp_path, outcome, course):
     before = random_flight(outcome=outcome)
     before.position[-1] = math.nan

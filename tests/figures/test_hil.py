@@ -306,7 +306,7 @@ def test_a_flight_without_poses_and_one_without_ticks(tmp_path):
     chain = FlightChain(Wobble(), CIRCLE, ChainConfig(SafetyLimits.of_track(CIRCLE)))
     with FlightRecorder(tmp_path / FILE, ABOUT) as recorder:
         for index in range(5):
-            inputs = Inputs(PERIOD * index, [], Operator(False, False), False)
+            inputs = Inputs(PERIOD * index, [], Operator(False, False), 0)
             took = dict.fromkeys(("jitter", "render", "act", "sent"), 0.0)
             outputs = describe_outputs(chain.tick(inputs))
             recorder.tick(0.0, {"in": describe_inputs(inputs), "out": outputs, "took": took})

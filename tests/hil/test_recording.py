@@ -126,5 +126,5 @@ def test_there_must_be_one(tmp_path):
 
 def test_a_newer_version_is_refused(tmp_path):
     FlightRecorder(tmp_path / FILE, {"format_version": 99}).close()
-    with pytest.raises(ValueError, match="a flight of version 99; this release reads version 1"):
+    with pytest.raises(ValueError, match="a flight of version 99; this release reads version 2"):
         Flight(tmp_path)

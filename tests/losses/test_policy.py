@@ -226,6 +226,17 @@ def test_what_was_just_flown_has_not_drifted():
     assert min(map(len, followed)) == 1 and max(map(len, followed)) > 10
 
 
+def test_the_actor_of_an_update_learns_as_without_it():
+    gradients = {}
+    for scale in (0.0, 5.0):
+        learner = make_learner(drift_scale=scale)
+        batch = stored_by(learner)
+        torch.manual_seed(0)  # of what is imagined
+        learner._backward(batch)
+        gradients[scale] = [parameter.grad.clone() for parameter in learner.agent.actor.parameters()]
+    assert all(map(torch.equal, gradients[0.0], gradients[5.0])) and any(gradient.any() for gradient in gradients[0.0])
+
+
 def test_what_has_not_changed_is_no_drift_nor_what_an_episode_begins_after():
     """The latents that the first record of an episode has stored are not those that its predecessor was seen with."""
     learner = make_learner(drift_scale=2.0)

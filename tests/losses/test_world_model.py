@@ -76,6 +76,9 @@ def test_losses_of_a_new_model(image_size):
     torch.testing.assert_close(losses["loss_image"], losses["image_error"] * image_size**2 * 3)
     torch.testing.assert_close(losses["reward_error"], batch["reward"].abs().mean())
     assert latents.belief.shape[:2] == (2, 4) and latents.belief.requires_grad
+    losses["loss_image"].backward()
+    for network in (loss.world_model.encoder, loss.world_model.decoder):
+        assert all(parameter.grad.abs().sum() > 0 for parameter in network.parameters())
 
 
 def agent_that_goes_on() -> Agent:

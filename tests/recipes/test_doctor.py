@@ -12,7 +12,7 @@ import pytest
 from dreamer_racing import doctor
 from dreamer_racing.experience.replay_place import replay_bytes
 from dreamer_racing.modules import SIZES
-from tests.running_recipes import compose, recipe, recipe_module
+from tests.running_recipes import compose, recipe, recipe_module, refused
 
 Verdict = doctor.Verdict
 
@@ -32,6 +32,10 @@ def test_what_does_not_fit_is_wrong_and_ends_with_1(tmp_path: Path) -> None:
     lines = done.stdout.splitlines()
     (memory,) = (number for number, line in enumerate(lines) if line.startswith("memory"))
     assert "WRONG" in lines[memory] and "lower replay.capacity=" in lines[memory + 1]
+
+
+def test_settings_are_checked(tmp_path: Path) -> None:
+    assert "checkpoint.keep=0: must be at least 1" in refused("doctor", "checkpoint.keep=0", cwd=tmp_path)
 
 
 def test_it_asks_for_what_a_default_run_takes() -> None:

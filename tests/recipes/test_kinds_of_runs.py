@@ -184,8 +184,10 @@ def test_a_run_in_the_control_suite(tmp_path: Path) -> None:
 
 @pytest.mark.slow
 def test_a_run_without_images(tmp_path: Path) -> None:
-    completed("dreamer_v3", *TINY, "env.from_pixels=false", AT_THE_END, "run_dir=run", cwd=tmp_path)
+    often = ("checkpoint.minutes=1e-6", "checkpoint.keep=9")
+    completed("dreamer_v3", *TINY, "env.from_pixels=false", AT_THE_END, *often, "run_dir=run", cwd=tmp_path)
     run_dir = tmp_path / "run"
+    assert len(list((run_dir / "checkpoints").glob("checkpoint-*"))) > 2
     table = rows(run_dir)
     for column in ("loss_vector", "evaluation/gates_per_episode", "evaluation/success_rate"):
         assert any(row[column] for row in table), column

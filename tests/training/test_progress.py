@@ -302,6 +302,8 @@ def test_what_is_said_or_logged_stands_above_and_the_table_stays(monkeypatch: py
     with Progress(total=100) as progress:
         progress.show(TRAINING)
         progress.write_line(said)
+        assert terminal.screen[0] == said and terminal.screen[1].startswith("  0%|")
+        assert terminal.screen[3].split()[:3] == ["training", "0", "12.35"]
         logging.getLogger("dreamer_racing.test").warning("the disk is slow\nfor 5 s")
         progress.show(TRAINING | {"loss": 0.75})
         assert terminal.screen[:3] == [said, "the disk is slow", "for 5 s"] and len(terminal.screen) == 7
