@@ -16,7 +16,10 @@ from dreamer_racing.envs.torchrl_env import DroneRacingEnv
 def flights(
     action: np.ndarray, steps: int, key: str, observation: str = "pixels", **options: Any
 ) -> dict[str, list[np.ndarray]]:
-    """An entry of the observations of a flight on the circle: after a reset, and after each step of the same action."""
+    """An entry of the observations of a flight on the circle: after a reset, and after each step of the same action.
+
+    TorchRL's checker has found nothing.
+    """
     seed, of_arrays = options["seed"], {**options, "observation": observation}
     single = gymnasium.make("dreamer_racing/Circle-v0", **of_arrays)
     vector = DroneRaceVectorEnv(1, "circle", **of_arrays)

@@ -103,13 +103,13 @@ def completed(name: str, *overrides: str, **given: Any) -> subprocess.CompletedP
 
 
 def python(
-    *arguments: str, cwd: Path | None = None, without: Collection[str] = (), **variables: str
+    *arguments: str, cwd: Path | None = None, without: Collection[str] = (), timeout: float = 300, **variables: str
 ) -> subprocess.CompletedProcess[str]:
     """Run Python on this repository, with some variables of the environment set and others unset."""
     kept = {name: value for name, value in os.environ.items() if name not in without}
     return subprocess.run(
         [sys.executable, *arguments], cwd=cwd, env={**kept, "PYTHONPATH": str(ROOT), **variables},
-        capture_output=True, text=True, timeout=900, check=False,
+        capture_output=True, text=True, timeout=timeout, check=False,
     )  # fmt: skip
 
 

@@ -94,10 +94,15 @@ def check_contract(contract: dict[str, Any], track: Track, rate: float | None = 
     differing = []
     source, own_rate = contract["source"], contract["control"]["rate_hz"]
     geometry, found = source.get("track_sha256"), hash_track(track)
-    if geometry != found:
+    if geometry is None:
+        differing.append(
+            f"it lacks source.track_sha256, so whether it was trained on track={track.name} is unknown: export it "
+            "again with recipes/export.py, or give make_contract track_sha256=hash_track(track)"
+        )
+    elif geometry != found:
         differing.append(
             f"source.track is {source.get('track')!r}, whose gates, start and bounds have the hash "
-            f"{str(geometry)[:12]} (source.track_sha256), but those of track={track.name} have {found[:12]}"
+            f"{geometry[:12]} (source.track_sha256), but those of track={track.name} have {found[:12]}"
         )
     if rate is not None and abs(rate - own_rate) > 1e-6:
         differing.append(f"control.rate_hz is {own_rate:g}, but rate={rate:g}")

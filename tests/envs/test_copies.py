@@ -158,6 +158,6 @@ for env in envs:
 @pytest.mark.slow
 def test_twenty_processes_that_close_nothing_end_with_status_zero() -> None:
     pytest.importorskip("stable_baselines3")
-    done = python("-c", PROGRAM, OMP_NUM_THREADS="1")
+    done = python("-c", PROGRAM, timeout=900, OMP_NUM_THREADS="1")
     assert done.returncode == 0, done.stderr
     assert done.stdout.splitlines() == ["drawn"] * 24

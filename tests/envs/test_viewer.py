@@ -16,11 +16,14 @@ from dreamer_racing.envs import viewer
 from dreamer_racing.envs.drone.parameters import PRESETS
 from dreamer_racing.envs.torchrl_env import DroneRacingEnv
 
+# What MuJoCo's handle has, and what its stand-in keeps.
+HANDLE = ["cam", "viewport", "is_running", "lock", "set_texts", "set_images", "sync", "close", "model", "poses"]
+
 
 @pytest.fixture
 def handle(monkeypatch: pytest.MonkeyPatch) -> MagicMock:
     """In place of the handle of MuJoCo's viewer: keeps what it is given, and is closed after four pictures."""
-    handle = MagicMock(cam=mujoco.MjvCamera(), poses=[], viewport=mujoco.MjrRect(0, 0, 800, 600))
+    handle = MagicMock(spec=HANDLE, cam=mujoco.MjvCamera(), poses=[], viewport=mujoco.MjrRect(0, 0, 800, 600))
     handle.is_running.side_effect = lambda: handle.sync.call_count < 4
 
     def launch_passive(model: mujoco.MjModel, data: mujoco.MjData, **hidden: bool) -> MagicMock:

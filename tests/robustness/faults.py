@@ -318,7 +318,8 @@ class Arena:
     ) -> Case:
         """Begin or continue a run, disturbed by lines of Python before it, and let it come to its end; then compare.
 
-        The disturbed process must say some words, given as patterns, and end with a status; 0 is the end of the run.
+        The disturbed process must say some words, given as patterns, on either stream, and end with a
+        status; 0 is the end of the run.
         """
         done = self._run(*self._arguments(name), before=before)
         unsaid = [pattern for pattern in words if not re.search(pattern, done.stdout + done.stderr)]

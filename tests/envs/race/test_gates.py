@@ -90,12 +90,6 @@ def changed(**changes) -> dict[str, Track]:
         # a second gate counts in its turn and before a crash
         ([(-0.1, 0, 3), (1.3, 0, 3)], {"track": CLOSE, "target": 1}, (1, 0.0, NONE)),
         ([(-0.1, 0, 3), (0.6, 0, 3), (1.3, 0.9, 3)], {"track": CLOSE}, (1, 0.0, FRAME)),
-        # ground and bounding box
-        *(([(math.copysign(2, end[0]), 5, 3), end], {}, (0, 0.0, cause)) for end, cause in (
-            ((2, 0, 0.051), NONE), ((2, 0, 0.05), NONE), ((2, 0, 0.049), GROUND), ((2, 0, -3), GROUND),
-            ((2, 0, 50.1), OUTSIDE), ((50.1, 0, 3), OUTSIDE), ((-50.1, 0, 3), OUTSIDE), ((2, 50.1, 3), OUTSIDE),
-            ((2, -50.1, 3), OUTSIDE), ((2, 50.0, 3), NONE),
-        )),
         # the floor is the ground unless the box begins above it, which that of split_s does not
         ([(0, 0, 0.1), (0, 0, 0.04)], {"track": load_track("split_s")}, (0, 0.0, GROUND)),
         ([(2, 0, 1.1), (2, 0, 0.9)], changed(bounds_low=(-50.0, -50.0, 1.0)), (0, 0.0, OUTSIDE)),
@@ -103,6 +97,18 @@ def changed(**changes) -> dict[str, Track]:
 )  # fmt: skip
 def test_flights_by_hand(points, options, expected):
     assert sweep(**{"track": PLAIN, "points": points, **options}) == expected
+
+
+@pytest.mark.parametrize(
+    ("end", "cause"),
+    [
+        ((2, 0, 0.051), NONE), ((2, 0, 0.05), NONE), ((2, 0, 0.049), GROUND), ((2, 0, -3), GROUND),
+        ((2, 0, 50.1), OUTSIDE), ((50.1, 0, 3), OUTSIDE), ((-50.1, 0, 3), OUTSIDE), ((2, 50.1, 3), OUTSIDE),
+        ((2, -50.1, 3), OUTSIDE), ((2, 50.0, 3), NONE),
+    ],
+)  # fmt: skip
+def test_ground_and_bounding_box(end, cause):
+    assert sweep(PLAIN, [(math.copysign(2, end[0]), 5, 3), end]) == (0, 0.0, cause)
 
 
 @pytest.mark.parametrize("axis", [1, 2])

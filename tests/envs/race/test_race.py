@@ -96,23 +96,17 @@ BESIDE = [point + torch.tensor([2.0, 0.0, 0.0], dtype=torch.float64) for point i
 @pytest.mark.parametrize(
     ("arguments", "steps", "expected"),
     [
-        # flying round a gate is not the end
         ({}, [BESIDE], {"target_gate": 0, "gates_passed": 0, "terminated": False}),
-        # time is up
         ({"episode_steps": 3}, [STAY] * 2, {"truncated": False}),
         ({"episode_steps": 3}, [STAY] * 3, {"truncated": True, "terminated": False, "finished": False}),
-        # a lap may begin at any gate
         ({"target": 2}, [*LAP[2:], *LAP[:2]], {"lap_time": pytest.approx(0.08), "target_gate": 2, "finished": False}),
         ({"target": 2}, [*LAP[2:], LAP[0]], {"lap_time": 0.0, "target_gate": 1}),
-        # the last lap in the last step
         ({"episode_steps": 4, "laps": 1}, LAP, {"truncated": True, "finished": True}),
-        # a crash in the last step is terminated only
         (
             {"episode_steps": 1},
             [(HOVER, (0, 0, 0.01))],
             {"truncated": False, "terminated": True, "crash": CrashCause.GROUND, "reward_base": -4.0},
         ),
-        # a crash behind the finish is a crash, but the lap was flown
         (
             {"laps": 1},
             [*LAP[:3], (*LAP[3], (0, -4, 0.01))],
@@ -121,6 +115,11 @@ BESIDE = [point + torch.tensor([2.0, 0.0, 0.0], dtype=torch.float64) for point i
                 "terminated": True, "reward_base": -4.0, "body_rate_norm": 0.0,
             },
         ),
+    ],
+    ids=[
+        "flying round a gate is not the end", "time is not up", "time is up", "a lap may begin at any gate",
+        "three gates are no lap", "the last lap in the last step", "a crash in the last step is terminated only",
+        "a crash behind the finish is a crash, but the lap was flown",
     ],
 )  # fmt: skip
 def test_ends_by_hand(arguments, steps, expected):

@@ -266,6 +266,7 @@ def test_masked_images_are_rows_of_all_images(renderer: str, num_threads: int) -
 
 
 def test_auto_falls_back_and_says_why(monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture) -> None:
+    assert not opengl.loads("libno_such_library.so.1")
     monkeypatch.setattr(opengl, "loads", lambda library: False)
     rendering.log_once.cache_clear()
     with caplog.at_level(logging.INFO, logger=rendering.__name__):

@@ -478,7 +478,7 @@ def test_plain_tracks_are_other_races_than_each_other():
     ("track", "decoys", "words"),
     [
         ("circle", "paper", "decoys=paper .*figure8; track 'circle' has"),
-        ("figure8", "many", "=many: must be paper or none"),
+        ("figure8", "many", "decoys=many: must be paper or none"),
     ],
 )
 def test_decoys_that_are_not_there(track, decoys, words):
