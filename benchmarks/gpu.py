@@ -39,7 +39,7 @@ from dreamer_racing.envs.simulator.warp_device import load_warp
 from dreamer_racing.envs.worlds import RaceWorlds
 from dreamer_racing.evaluation.course import Course
 from dreamer_racing.evaluation.held_out import SEEN, held_out_metrics
-from dreamer_racing.learners.learner import LearnerConfig
+from dreamer_racing.learners.config import LearnerConfig
 from dreamer_racing.machine import provenance
 
 ROOT = Path(__file__).parent.parent

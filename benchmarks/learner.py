@@ -40,9 +40,9 @@ from torch.profiler import ProfilerActivity, profile
 from torch.utils.flop_counter import FlopCounterMode
 
 from dreamer_racing.experience.replay import make_replay
+from dreamer_racing.learners.config import LearnerConfig
 from dreamer_racing.learners.dreamer_v3 import DreamerV3
 from dreamer_racing.learners.latent_ppo import CRITICS, LatentPPO
-from dreamer_racing.learners.learner import LearnerConfig
 from dreamer_racing.learners.update import WorldModelLearner
 from dreamer_racing.losses import DreamerV3Losses, LatentPPOLosses
 from dreamer_racing.machine import keep_freed_memory

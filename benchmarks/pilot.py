@@ -17,7 +17,8 @@ import torch
 from measuring import make_parser, report
 
 from dreamer_racing.envs.race.gates import CrashCause
-from dreamer_racing.envs.race.pilot import PilotStatistics, ScriptedPilot, evaluate_pilot
+from dreamer_racing.envs.race.pilot import ScriptedPilot
+from dreamer_racing.envs.race.pilot_evaluation import PilotStatistics, evaluate_pilot
 from dreamer_racing.envs.race.racing_line import LineLimits
 from dreamer_racing.envs.tracks import PLAIN_TRACKS
 

@@ -48,7 +48,9 @@ TESTS = {
         "test_a_signal_saves_and_exits_cleanly_and_a_second_one_does_not_save",
         "test_ctrl_c_before_anything_is_there_is_no_traceback",
     ),
-    "power loss, or the machine is taken away": ("test_checkpoints_by_the_clock",),
+    "power loss, or the machine is taken away": (
+        "test_a_run_that_saves_on_the_way_does_so_within_two_minutes_and_then_by_the_clock",
+    ),
     "a file of a checkpoint is damaged or missing": (
         "test_every_damaged_or_missing_file_is_noticed_and_the_checkpoint_before_it_is_taken",
         "test_json_of_another_kind_is_damage",
@@ -91,7 +93,9 @@ TESTS = {
         "tests/training/test_session.py",
         "test_a_signal_saves_and_exits_cleanly_and_a_second_one_does_not_save",
     ),
-    "a run is killed early": ("test_a_run_that_saves_on_the_way_does_so_within_two_minutes",),
+    "a run is killed early": (
+        "test_a_run_that_saves_on_the_way_does_so_within_two_minutes_and_then_by_the_clock",
+    ),
     "the wrong Python, without the project's packages": ("tests/recipes/test_entry.py",),
     "an environment is copied, pickled or sent": ("tests/envs/test_copies.py",),
     "a worker process is killed": ("test_a_worker_that_is_killed_is_replaced_and_no_frame_is_lost_or_counted_twice",),

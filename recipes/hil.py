@@ -181,13 +181,12 @@ def replay(config: HilConfig) -> int:
     flight = Flight(Path(config.replay))
     try:
         flown = OmegaConf.to_object(OmegaConf.merge(OmegaConf.structured(HilConfig), flight.about["config"]))
-        track = flight.track()
     except (KeyError, TypeError, OmegaConfBaseException) as error:
         raise ValueError(
             f"replay={config.replay} was flown with settings that this version does not know "
             f"({str(error).partition(chr(10))[0]}): replay it with the version named in its recording."
         ) from error
-    settings = cast(HilConfig, flown)
+    settings, track = cast(HilConfig, flown), flight.track()
     check_settings(settings)
     flyer, _ = make_flyer(settings, track)
     settings.renderer = config.renderer

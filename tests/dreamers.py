@@ -11,9 +11,9 @@ import torch
 from tensordict import TensorDict
 from torch import Tensor
 
+from dreamer_racing.learners.config import LearnerConfig
 from dreamer_racing.learners.dreamer_v3 import DreamerV3
 from dreamer_racing.learners.latent_ppo import LatentPPO
-from dreamer_racing.learners.learner import LearnerConfig
 from dreamer_racing.losses import Latents, Trajectory
 from dreamer_racing.modules import RSSM, SIZES, Interface, ModelSize
 

@@ -18,10 +18,10 @@ from torch import Tensor
 
 from dreamer_racing import parallel
 from dreamer_racing.experience.replay import StreamReplay, make_replay
+from dreamer_racing.learners.config import LearnerConfig
 from dreamer_racing.learners.dreamer_v3 import DreamerV3
 from dreamer_racing.learners.gradient_step import NonFiniteLossError
 from dreamer_racing.learners.latent_ppo import LatentPPO
-from dreamer_racing.learners.learner import LearnerConfig
 from dreamer_racing.learners.update import WorldModelLearner
 from dreamer_racing.losses import DreamerV3Losses, LatentPPOLosses, PPOUpdateConfig
 from dreamer_racing.modules import Agent, Interface, get_size

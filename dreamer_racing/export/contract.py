@@ -29,8 +29,9 @@ def make_contract(
         parameters: Parameters of the drone that the agent was trained with.
         camera: Camera that the agent was trained with.
         imu: Errors of the IMU that the agent was trained with; None without one.
-        source: Origin of the agent, JSON values: checkpoint, env_steps, track and its `hash_track`, preset; and for a
-            track from a file its `describe_track` as ``track_description``.
+        source: Origin of the agent, JSON values: checkpoint, env_steps, preset, track and its `hash_track` as
+            ``track_sha256``, which flight requires; and for a track from a file its `describe_track` as
+            ``track_description``.
     """
     size = step.size
     outputs = dict(zip(OUTPUTS, step(*step.example_inputs().values()), strict=True))

@@ -139,8 +139,10 @@ class Flight:
 
         Raises:
             TrackError: The recorded track is damaged.
-            KeyError: The file holds no track.
+            ValueError: The file holds no track.
         """
+        if TRACK not in self.about:
+            raise ValueError(f"{self._path} holds no track ({TRACK}): it was not written by recipes/hil.py.")
         return read_track(self.about[TRACK], f"{self._path}: {TRACK}")
 
     def _read(self, path: Path) -> Iterator[tuple[str, dict[str, Any]]]:

@@ -15,7 +15,9 @@ from torch import Tensor, nn
 from torchrl.modules import PercentileValueNorm
 
 from dreamer_racing import parallel
-from dreamer_racing.learners.learner import LearnerConfig, Timer, untimed
+from dreamer_racing.learners.config import LearnerConfig
+from dreamer_racing.learners.gradient_step import GraphedStep
+from dreamer_racing.learners.learner import Timer, untimed
 from dreamer_racing.learners.update import WorldModelLearner, fill_given
 from dreamer_racing.losses import (
     DreamerV3Losses,
@@ -54,11 +56,6 @@ class DreamerV3(WorldModelLearner):
     def __init__(
         self, agent: Agent, losses: DreamerV3Losses | None = None, config: LearnerConfig | None = None
     ) -> None:
-        if config is not None and config.cuda_graph and config.imagination_every != 1:
-            raise ValueError(
-                f"imagination_every={config.imagination_every} with cuda_graph=True: a graph does the same in every "
-                "update. Use imagination_every=1, or cuda_graph=False."
-            )
         losses = losses or DreamerV3Losses()
         self.objective = find_objective(losses.actor, collected=False)
         device = next(agent.parameters()).device
@@ -193,6 +190,15 @@ class DreamerV3(WorldModelLearner):
     def state_dict(self) -> dict[str, Any]:
         """Return everything that the next update depends on, except the global random generators."""
         return {**super().state_dict(), "return_range": self.return_range.state_dict()}
+
+    def _make_graph(self) -> GraphedStep:
+        """Return ``_backward`` as a step that is replayed as one CUDA graph; see `WorldModelLearner`."""
+        if self.config.imagination_every != 1:
+            raise ValueError(
+                f"imagination_every={self.config.imagination_every} with cuda_graph=True: a graph does the same in "
+                "every update. Use imagination_every=1, or cuda_graph=False."
+            )
+        return super()._make_graph()
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
         """Restore what ``state_dict`` returned; see `WorldModelLearner.load_state_dict`."""

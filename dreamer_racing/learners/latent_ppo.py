@@ -26,8 +26,9 @@ from torch import Tensor, nn
 
 from dreamer_racing import parallel
 from dreamer_racing.experience.rollouts import RolloutStorage
+from dreamer_racing.learners.config import LearnerConfig
 from dreamer_racing.learners.gradient_step import restore
-from dreamer_racing.learners.learner import LearnerConfig, Timer, untimed
+from dreamer_racing.learners.learner import Timer, untimed
 from dreamer_racing.learners.update import WorldModelLearner
 from dreamer_racing.losses import LatentPPOLosses, Trajectory, find_objective, normalized, rollout_return
 from dreamer_racing.losses.config import KL_TOLERANCE, PPOUpdateConfig

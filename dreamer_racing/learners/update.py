@@ -17,8 +17,9 @@ from tensordict import TensorDict, TensorDictBase
 from torch import Tensor, nn
 
 from dreamer_racing import parallel
+from dreamer_racing.learners.config import LearnerConfig
 from dreamer_racing.learners.gradient_step import FiniteGuard, GraphedStep, gradient_norms, restore
-from dreamer_racing.learners.learner import LearnerConfig, Timer, ValueFunction, seeded, untimed
+from dreamer_racing.learners.learner import Timer, ValueFunction, seeded, untimed
 from dreamer_racing.learners.saved import UnmatchedWeights, check_saved, check_weights, load_parameters, own_state
 from dreamer_racing.losses import Latents, LossConfig, WorldModelLoss, find_targets, policy_drift, replay_critic_loss
 from dreamer_racing.modules import Agent, DreamerPolicy, Interface, ModelSize, get_size

@@ -4,18 +4,15 @@
 """
 
 from dreamer_racing.losses.config import HORIZON, DreamerV3Losses, LatentPPOLosses, LossConfig, PPOUpdateConfig
+from dreamer_racing.losses.imagination import Imagination, Starts, choose_starts, imagine
 from dreamer_racing.losses.policy import (
     OBJECTIVES,
-    Imagination,
     Objective,
-    Starts,
     Trajectory,
-    choose_starts,
     clipped_surrogate,
     dynamics,
     find_objective,
     gradient_of_actions,
-    imagine,
     normalized,
     policy_drift,
     reinforce,

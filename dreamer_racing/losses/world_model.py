@@ -17,11 +17,12 @@ from tensordict.utils import NestedKey
 from torch import Tensor, nn
 
 from dreamer_racing.losses.config import LossConfig
-from dreamer_racing.modules.agent import Agent, WorldModel
+from dreamer_racing.modules.agent import Agent
 from dreamer_racing.modules.autoencoder import VectorDecoder
 from dreamer_racing.modules.interface import PIXELS, PRIVILEGED
 from dreamer_racing.modules.layers import autocast, linear
 from dreamer_racing.modules.rssm import CONTEXT, Posterior, join_features, mix_uniform
+from dreamer_racing.modules.world_model import WorldModel
 from dreamer_racing.settings import import_own, suggestion
 
 OPEN_LOOP_STARTS = 64

@@ -1,7 +1,7 @@
 """Networks of the agent, on plain tensors; only `DreamerPolicy` and `LatentFormat` use TensorDict."""
 
 import dreamer_racing.envs  # noqa: F401 - heeds MUJOCO_GL before TorchRL imports MuJoCo
-from dreamer_racing.modules.agent import Agent, DreamerPolicy, WorldModel
+from dreamer_racing.modules.agent import Agent, DreamerPolicy
 from dreamer_racing.modules.autoencoder import (
     ImageDecoder,
     ImageEncoder,
@@ -24,6 +24,7 @@ from dreamer_racing.modules.interface import Interface
 from dreamer_racing.modules.recurrent_cells import BlockGRUCell, DenseGRUCell
 from dreamer_racing.modules.rssm import RSSM, Posterior, join_features
 from dreamer_racing.modules.sizes import SIZES, ModelSize, get_size
+from dreamer_racing.modules.world_model import WorldModel
 
 __all__ = [
     "MLP",

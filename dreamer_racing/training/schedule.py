@@ -16,9 +16,9 @@ import torch
 from tensordict import TensorDictBase
 from torch import Tensor
 
-from dreamer_racing.experience.rollouts import GatePassRate
 from dreamer_racing.losses.config import KL_TOLERANCE
 from dreamer_racing.settings import COUNT, POSITIVE, Range, allowed_values, setting
+from dreamer_racing.training.episodes import GatePassRate
 
 logger = logging.getLogger(__name__)
 

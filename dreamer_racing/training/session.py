@@ -22,11 +22,12 @@ from torchrl.envs import EnvBase
 from torchrl.record.loggers import Logger
 
 from dreamer_racing import parallel
-from dreamer_racing.experience.rollouts import CollectorState, EpisodeTracker, Rollouts, WorkerError
+from dreamer_racing.experience.rollouts import CollectorState, Rollouts, WorkerError
 from dreamer_racing.machine import KeptMemory
 from dreamer_racing.settings import COUNT, NOT_NEGATIVE, setting
 from dreamer_racing.training.checkpoint import BestCheckpoint, RunCheckpointError, RunCheckpoints
 from dreamer_racing.training.directory import RunDirectory, RunLock, latest_checkpoint
+from dreamer_racing.training.episodes import EpisodeTracker
 from dreamer_racing.training.metrics import Journal, MetricsLog
 from dreamer_racing.training.progress import Interval, Periods, Progress, RunClock
 from dreamer_racing.training.signals import GracefulExit

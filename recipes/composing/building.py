@@ -32,7 +32,6 @@ from dreamer_racing.envs.race.gates import CrashCause
 from dreamer_racing.envs.tracks import BUILTIN_TRACKS, describe_track, load_track
 from dreamer_racing.experience.replay import SequenceReplayConfig, StreamReplay, make_replay
 from dreamer_racing.experience.replay_place import choose_place, replay_bytes
-from dreamer_racing.experience.rollouts import EpisodeTracker
 from dreamer_racing.export.agents import existing_agent_path
 from dreamer_racing.export.shipped_agent import is_agent, load_trained
 from dreamer_racing.figures.report import EvaluationReport, ReturnReport
@@ -47,6 +46,7 @@ from dreamer_racing.modules.interface import PRIVILEGED
 from dreamer_racing.modules.rssm import LatentFormat
 from dreamer_racing.training.checkpoint import load_state
 from dreamer_racing.training.directory import RunDirectory, latest_checkpoint
+from dreamer_racing.training.episodes import EpisodeTracker
 from dreamer_racing.training.session import Evaluator
 
 if TYPE_CHECKING:

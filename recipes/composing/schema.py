@@ -18,7 +18,7 @@ from dreamer_racing.experience.ray_cluster import WorkersConfig
 from dreamer_racing.experience.replay import ReplayConfig, SequenceReplayConfig
 from dreamer_racing.figures.loggers import LoggerConfig
 from dreamer_racing.learners import PPOConfig, SACConfig
-from dreamer_racing.learners.learner import LearnerConfig
+from dreamer_racing.learners.config import LearnerConfig
 from dreamer_racing.losses import DreamerV3Losses, LatentPPOLosses, LossConfig, find_objective
 from dreamer_racing.modules import get_size
 from dreamer_racing.modules.autoencoder import smallest_map

@@ -24,8 +24,8 @@ from dreamer_racing.experience.ray_cluster import check_resources, check_version
 from dreamer_racing.experience.ray_rollouts import RayRollouts, WorkerError
 from dreamer_racing.experience.ray_worker import RayWorker, Request, as_arrays, pack_rollout, unpack_rollout
 from dreamer_racing.experience.replay import make_replay
-from dreamer_racing.experience.rollouts import EpisodeTracker
 from dreamer_racing.modules import DreamerPolicy, Interface
+from dreamer_racing.training.episodes import EpisodeTracker
 from tests.dreamers import learner_of
 from tests.ray_workers import small_race, worlds_of_worker
 

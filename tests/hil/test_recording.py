@@ -128,3 +128,9 @@ def test_a_newer_version_is_refused(tmp_path):
     FlightRecorder(tmp_path / FILE, {"format_version": 99}).close()
     with pytest.raises(ValueError, match="a flight of version 99; this release reads version 2"):
         Flight(tmp_path)
+
+
+def test_a_flight_without_its_track_is_refused(tmp_path):
+    FlightRecorder(tmp_path / FILE, {}).close()
+    with pytest.raises(ValueError, match=r"holds no track \(track_as_flown\): it was not written by recipes/hil.py"):
+        Flight(tmp_path).track()

@@ -12,9 +12,9 @@ from omegaconf import OmegaConf
 from torchrl.envs.transforms import Transform
 
 from dreamer_racing.envs.tracks import load_track
-from dreamer_racing.experience.rollouts import GatePassRate
 from dreamer_racing.figures.runs import flatten
 from dreamer_racing.modules import Interface
+from dreamer_racing.training.episodes import GatePassRate
 from dreamer_racing.training.schedule import DreamerV3ScheduleConfig, Schedule
 from tests.running_recipes import CONFIG, EXPERIMENTS, build, compose, prepared, recipe_module, run_config
 

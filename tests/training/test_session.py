@@ -17,8 +17,9 @@ import pytest
 import torch
 from tensordict import TensorDict, TensorDictBase
 
-from dreamer_racing.experience.rollouts import EpisodeTracker, Rollouts, WorkerError
+from dreamer_racing.experience.rollouts import Rollouts, WorkerError
 from dreamer_racing.training.directory import RunDirectory, env_steps_of
+from dreamer_racing.training.episodes import EpisodeTracker
 from dreamer_racing.training.session import Session
 from dreamer_racing.training.signals import GracefulExit
 

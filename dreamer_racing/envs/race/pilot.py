@@ -1,16 +1,15 @@
-"""A scripted, state-based pilot that flies N drones along a planned racing line, and statistics of its flights.
+"""A scripted, state-based pilot that flies N drones along a planned racing line.
 
 `ScriptedPilot` projects a drone onto the line (`envs.race.racing_line`) and controls it with position and velocity
 feedback, acceleration and rate feedforward, and a prediction over the command delay. It is the reference for lap times,
 and a demonstrator: it can also fly from the start poses of training episodes.
 
-Shapes: N drones, K samples of the line, L laps, T control steps. SI units, world z up, attitude wxyz, body frame FLU.
-All numbers are this project's choice.
+Shapes: N drones, K samples of the line. SI units, world z up, attitude wxyz, body frame FLU. All numbers are this
+project's choice.
 """
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
 
 import torch
 from tensordict import TensorDictBase
@@ -19,11 +18,8 @@ from torch import Tensor
 
 from dreamer_racing.envs.drone.parameters import GRAVITY, QuadrotorParameters, load_preset, without_randomisation
 from dreamer_racing.envs.drone.rotation import rotate, rotate_inverse, turn
-from dreamer_racing.envs.race.race import EVALUATION_TIME
 from dreamer_racing.envs.race.racing_line import Dynamics, LineLimits, Reference, plan_racing_line
-from dreamer_racing.envs.simulator.rendering import is_in_view, points_in_camera
 from dreamer_racing.envs.tracks import Track, load_track
-from dreamer_racing.envs.worlds import RaceWorlds
 
 
 class ScriptedPilot:
@@ -272,82 +268,3 @@ PILOTS: dict[str, Callable[[Track, QuadrotorParameters], TensorDictModuleBase]] 
     "hover": _hover,
 }
 """Factories of policies that fly by the true state, given the track and the drone's parameters."""
-
-
-@dataclass(frozen=True)
-class PilotStatistics:
-    """Statistics of N episodes."""
-
-    gates: Tensor  # (N,) int64, passed
-    finished: Tensor  # (N,) bool: all laps, no crash
-    crash: Tensor  # (N,) int64 `CrashCause`
-    lap_times: Tensor  # (N, L) s; NaN if not completed; the first lap begins at rest
-    speed_mean: Tensor  # (N,) m/s
-    speed_max: Tensor  # (N,) m/s
-    gate_offset_max: Tensor  # (N,) m
-    gate_in_view: Tensor  # (N,) fraction of time with the target gate's centre in the nose camera's image
-
-
-def evaluate_pilot(
-    track: str | Track,
-    preset: str | QuadrotorParameters = "easy",
-    num_envs: int = 1,
-    *,
-    laps: int = 3,
-    pilot: ScriptedPilot | None = None,
-    random_starts: bool = False,
-    seed: int = 0,
-) -> PilotStatistics:
-    """Fly N complete episodes of L laps and return their statistics.
-
-    The pilot is a `ScriptedPilot` with default limits if None. With ``random_starts`` episodes start as in training,
-    instead of at the start pose. The seed is of randomisation and starts.
-    """
-    parameters = load_preset(preset)
-    worlds = RaceWorlds(
-        track,
-        num_envs,
-        parameters,
-        evaluation=not random_starts,
-        from_pixels=False,
-        episode_steps=round(EVALUATION_TIME / parameters.control_dt),
-        seed=seed,
-    )
-    worlds.race.laps = laps
-    pilot = pilot or ScriptedPilot(worlds.track, parameters, dtype=worlds.dtype)
-    steps, time = _fly(worlds, pilot)
-    worlds.close()
-    at_lap = (steps["gates_passed"] // worlds.track.num_gates).unsqueeze(-1)  # (T, N, 1)
-    of_lap = at_lap == torch.arange(1, laps + 1, device=worlds.device)  # (T, N, L)
-    lap_times = (steps["lap_time"].unsqueeze(-1) * of_lap).amax(0)  # (N, L)
-    return PilotStatistics(
-        gates=steps["gates_passed"].amax(0),
-        finished=steps["finished"].any(0),
-        crash=steps["crash"].amax(0),
-        lap_times=torch.where(lap_times > 0.0, lap_times, math.nan),
-        speed_mean=steps["speed"].sum(0) / time,
-        speed_max=steps["speed"].amax(0),
-        gate_offset_max=steps["gate_offset"].amax(0),
-        gate_in_view=steps["seen"].sum(0) / time,
-    )
-
-
-def _fly(worlds: RaceWorlds, pilot: ScriptedPilot) -> tuple[dict[str, Tensor], Tensor]:
-    """Fly one episode in every world; return its steps (T, N), zero after its end, and its number of steps (N,)."""
-    pilot.reset()
-    worlds.reset()
-    names = ("gates_passed", "lap_time", "finished", "crash", "gate_offset")
-    centres = worlds.track.gate_positions(worlds.device, worlds.dtype)
-    state, flying, steps = worlds.simulator.state, torch.ones_like(worlds.race.target_gate, dtype=torch.bool), []
-    while flying.any():
-        gate = worlds.race.target_gate
-        in_camera = points_in_camera(state.position, state.attitude, centres[gate].unsqueeze(1), worlds.camera)
-        seen = is_in_view(in_camera, worlds.camera).squeeze(1)  # the target gate's centre; occlusion is ignored
-        outcome = worlds.step(pilot.act(state.position, state.attitude, state.linear_velocity, state.body_rates, gate))
-        values = {name: getattr(outcome, name) for name in names}
-        values |= {"speed": state.linear_velocity.norm(dim=-1), "seen": seen, "flew": flying}
-        steps.append({name: value * flying for name, value in values.items()})
-        flying = flying & ~(outcome.terminated | outcome.truncated)
-    stacked = {name: torch.stack([step[name] for step in steps]) for name in steps[0]}
-    flew = stacked.pop("flew")
-    return stacked, flew.sum(0)

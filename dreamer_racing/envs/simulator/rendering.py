@@ -40,7 +40,8 @@ T = TypeVar("T")
 
 RENDERERS = ("egl", "osmesa", "warp")
 WARP_CUDA = "warp_cuda"
-EXIT_PATIENCE = 10.0  # s, at most, for which the process's exit waits for a frame that is being rendered [choice]
+EXIT_PATIENCE = 10.0
+"""Maximum time for which the exit of the process waits for a frame that is being rendered, s [choice]."""
 
 
 class Worker(Protocol):

@@ -136,7 +136,10 @@ def build_drone(parameters: QuadrotorParameters) -> mujoco.MjSpec:
 
 
 def build_scene(track: Track, parameters: QuadrotorParameters, camera: Camera | None = None) -> mujoco.MjSpec:
-    """Build the scene of a track: `build_drone` with the camera `nose`, in a hall whose walls are the bounding box."""
+    """Build the scene of a track: gates and decoys in a hall whose walls are the bounding box, and the drone.
+
+    The drone is `build_drone` with the camera ``nose``; None is the default camera.
+    """
     camera = camera or Camera()
     spec = build_drone(parameters)
     spec.modelname = f"drone_race_{track.name}"

@@ -28,14 +28,26 @@ from dreamer_racing.envs.tracks.track import (
     require_vector,
 )
 
-ROUNDING = 1e-9  # m, tolerance for rounding errors of points on a limit
-# limits of a track, all [choice]
-START_CLEARANCE = 0.3  # m, at least, of every start from the bounding box and the ground
-GATE_CLEARANCE = 1.0  # m, at least, of a start from a gate's plane: training noise moves a start by at most 0.71 m
-MAX_COORDINATE = 1000.0  # m, at which float32 still resolves 0.1 mm
-FARTHEST_LEG = 540.0  # m, at most, from one gate to the next: a whole evaluation, 30 s, at 18 m/s
-MIN_DIMENSION = 0.01  # m, at least, of a gate's opening, depth and frame width
-MAX_GATES, MAX_LAPS = 200, 1000  # at most; of gates and decoys together, all pairs are checked
+ROUNDING = 1e-9
+"""Tolerance (m) for rounding errors of points on a limit."""
+
+START_CLEARANCE = 0.3
+"""Minimum distance (m) of every start from the bounding box and the ground [choice]."""
+
+GATE_CLEARANCE = 1.0
+"""Minimum distance (m) of a start from a gate's plane: training noise moves a start by at most 0.71 m [choice]."""
+
+MAX_COORDINATE = 1000.0
+"""Largest coordinate (m), at which float32 still resolves 0.1 mm [choice]."""
+
+FARTHEST_LEG = 540.0
+"""Largest distance (m) from one gate to the next: a whole evaluation, 30 s, at 18 m/s [choice]."""
+
+MIN_DIMENSION = 0.01
+"""Minimum opening, depth and frame width of a gate (m) [choice]."""
+
+MAX_GATES, MAX_LAPS = 200, 1000
+"""Maximum number of gates and decoys together, of which all pairs are checked, and of laps [choice]."""
 
 
 def validate_track(track: Track, source: str) -> None:

@@ -6,7 +6,8 @@ import torch
 from dreamer_racing.envs.drone.parameters import PRESETS
 from dreamer_racing.envs.race import racing_line
 from dreamer_racing.envs.race.gates import CrashCause
-from dreamer_racing.envs.race.pilot import ScriptedPilot, evaluate_pilot
+from dreamer_racing.envs.race.pilot import ScriptedPilot
+from dreamer_racing.envs.race.pilot_evaluation import evaluate_pilot
 from dreamer_racing.envs.race.racing_line import (
     START_LINE,
     Dynamics,
