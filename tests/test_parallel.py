@@ -232,13 +232,22 @@ def save_shares(folder: Path) -> None:
     checkpoints.load()
     assert torch.equal(torch.rand(3), torch.load(folder / f"random_{parallel.rank()}.pt"))
     assert contents(replay) == torch.load(folder / f"contents_{parallel.rank()}.pt")
-    on_a_full_disk = SimpleNamespace(dump=lambda path: fail("disk full"), load=None)
-    parts = {"counters": counters, "replay": on_a_full_disk if parallel.rank() else replay}
+    parts = {"counters": counters, "replay": Unsavable() if parallel.rank() else replay}
     checkpoints = RunCheckpoints(folder, parts, own=["replay"])
     with pytest.raises(RunCheckpointError, match="full"):
         checkpoints.save(130)
     parallel.run_in_all(lambda: None)  # the first has cleared it away
     assert [path.name for path in (folder / "checkpoints").iterdir()] == ["checkpoint-000000000120"]
+
+
+class Unsavable:
+    """A replay on a full disk."""
+
+    def dump(self, path: Path) -> None:
+        raise OSError("disk full")
+
+    def load(self, path: Path) -> None:
+        raise NotImplementedError
 
 
 def load_shares(folder: Path) -> None:
