@@ -44,9 +44,9 @@ How well each algorithm flies here, what that took, and the command that runs it
   (one run of Circle for 33, on an AMD EPYC in bfloat16). Split-S: 92 %, one seed.
 - **DreamerV3** learns in imagination. Nearly today's default raced Kidney (one seed), the one before, *C*, Circle
   (two), Kidney (one; another was cut short) and Figure 8 (one complete run): 100 %, 90 % after 27 to 90 minutes.
-- **Without the true state** latent PPO (100 %, two seeds) and DreamerV3 race Circle. Of five seeds of
-  DreamerV3 four ended at 95 to 99 % after 125 to 148 minutes (two with settings that were changed on the way), and one
-  was cut short at 71 % after 120. All had 90 % after 80 to 106 minutes, and swing.
+- **Without the true state** latent PPO (100 %, two seeds) and DreamerV3 race Circle. Five seeds of
+  DreamerV3 ended at 91 to 99 % after 125 to 148 minutes (two with settings that were changed on the way; one had 71 %
+  six minutes before its end). All had 90 % after 80 to 106 minutes, and swing.
 - **PPO from the true state** flies three clean laps after 3 to 11 minutes.
 
 ## How success is measured
