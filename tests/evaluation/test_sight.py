@@ -23,7 +23,7 @@ from dreamer_racing.evaluation.trajectory import Trajectory
 from dreamer_racing.figures.protocol import plot_sight
 from dreamer_racing.modules import Interface
 from tests.dreamers import learner_of
-from tests.figures.test_flights import level_flight
+from tests.flights import level_flight
 
 LEVEL = Camera(tilt=0.0, position=(0.0, 0.0, 0.0))
 

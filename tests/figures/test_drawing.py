@@ -23,7 +23,7 @@ from dreamer_racing.figures.flights import CELL, plot_top_down, plot_tracks
 from dreamer_racing.figures.report import ReturnReport
 from dreamer_racing.modules import Interface
 from tests.dreamers import learner_of
-from tests.figures.test_flights import level_flight
+from tests.flights import level_flight
 
 
 def straight_flight(track, outcome: str = "ground") -> Trajectory:

@@ -23,7 +23,7 @@ from dreamer_racing.envs.tracks import load_track
 from dreamer_racing.evaluation.trajectory import Trajectory
 from dreamer_racing.figures import film
 from dreamer_racing.figures.report import chase_beside_onboard
-from tests.figures.test_flights import level_flight, random_flight
+from tests.flights import level_flight, random_flight
 
 PALETTE = np.array([[200, 30, 30], [30, 200, 30], [30, 30, 200], [240, 240, 240]], dtype=np.uint8)
 

@@ -28,7 +28,7 @@ from dreamer_racing.hil.recording import FILE, TRACK, Flight, FlightRecorder
 from dreamer_racing.hil.safety import SafetyLimits
 from dreamer_racing.hil.stamping import Stamping
 from dreamer_racing.hil.vehicle import GRAVITY, Pose, Setpoint
-from tests.figures.test_flights import level_flight
+from tests.flights import level_flight
 
 CIRCLE = load_track("circle")  # gates of 4 m from the middle, at 0, 90, 180 and 270 degrees, flown anticlockwise
 RADIUS, SPIN, ANGLE = 4.2, 2.0, -0.5  # m, rad/s, rad at the start

@@ -15,7 +15,7 @@ from dreamer_racing.evaluation.trajectory import write_trajectory
 from dreamer_racing.figures import plotting
 from dreamer_racing.figures.curves import read_curves
 from tests.figures.test_curves import write_run
-from tests.figures.test_flights import flat_dream, random_flight
+from tests.flights import flat_dream, random_flight
 from tests.running_recipes import ROOT, completed, recipe, recipe_module, refused
 
 pytestmark = pytest.mark.xdist_group("figures")  # one worker makes what these tests share
