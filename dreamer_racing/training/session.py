@@ -377,9 +377,10 @@ class Session:
             self.directory.finished.unlink()  # the run resumes from before its end
 
     def _end(self) -> None:
-        """Save everything, and report how the run ended."""
+        """Save everything, and report how the run ended; a signal that comes during this last save changes nothing."""
+        stopped = self.stopping
         saved = self.save()
-        if self.stopping:
+        if stopped:
             at = f"{Signals(self._signal).name} at {self.env_steps:,} of {self.config.total_env_steps:,} env_steps"
             self.write_line(f"{at}: saved; continue with resume={self.directory.path}")
         elif self.metrics is not None:
@@ -387,5 +388,5 @@ class Session:
             self.directory.mark_finished(self.env_steps)
         self.write_line(f"checkpoint: {saved}")
         self._stack.close()
-        if self.stopping:
+        if stopped:
             raise SystemExit(128 + self._signal)

@@ -160,6 +160,18 @@ def test_a_policy_with_updates_left_to_make_is_evaluated_once_a_resumed_run_has_
     assert resumed.go()[0] == ("evaluated", 44) and RunDirectory(tmp_path).finished.exists()
 
 
+def test_a_run_whose_last_save_is_under_way_has_finished_whatever_signal_comes(tmp_path: Path) -> None:
+    run = Run(tmp_path, total=40, rollout=4)
+    save = run.session.checkpoints.save
+
+    def interrupted(env_steps: int, *rest: Any) -> Path:
+        os.kill(os.getpid(), signal.SIGTERM)
+        return save(env_steps, *rest)
+
+    run.session.checkpoints.save = interrupted
+    assert ("saved", 44) in run.go() and RunDirectory(tmp_path).finished.exists()
+
+
 def test_what_was_delivered_before_workers_were_lost_is_saved(tmp_path: Path) -> None:
     run = Run(tmp_path, total=40, rollout=4, fails_after=3)
     with pytest.raises(WorkerError):
