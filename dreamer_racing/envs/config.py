@@ -21,7 +21,7 @@ ALL_SUITES = ("suite", "num_envs", "device", "episode_steps", "from_pixels", "im
 MISSING = "???"  # OmegaConf's marker of a mandatory value; this package does not import OmegaConf
 TRAINING_ONLY = (
     "episode_steps", "start_beyond_gate", "start_at_gate", "start_on_line", "miss_radius", "action_change_weight",
-    "looks",
+    "gaze_weight", "looks",
 )  # fmt: skip
 """Settings of training races that evaluation races do not take."""
 
@@ -54,6 +54,8 @@ class EnvConfig:
     miss_radius: float = setting(0.0, NOT_NEGATIVE)
     # b3, penalty in training per unit of |a_t - a_t-1|^2; 0: none, as in the paper; 1e-4 in champion-level racing
     action_change_weight: float = setting(0.0, NOT_NEGATIVE)
+    # b4, reward in training per step for looking at the target gate, times the cosine of the angle; 0 as in the paper
+    gaze_weight: float = setting(0.0, NOT_NEGATIVE)
     # device of the training and evaluation environments: cpu | cuda | auto (the learner's if supported)
     device: str = "auto"
     renderer: str = "auto"  # auto | egl | osmesa | warp | warp_cuda; on cuda auto | warp
