@@ -387,24 +387,22 @@ class RaceWorlds:
         """Simulate one control step and apply the race rules, without synchronising with a CUDA device."""
         invalid = ~action.isfinite().all(dim=1)
         flown = action.nan_to_num(0.0, 0.0, 0.0)
-        goes_on = self.race.step_count > 0  # the first step of an episode has no previous action
+        first = self.race.step_count == 0  # the first step of an episode has no previous action
         before = None if self.custom_reward is None else self.race_state()
         path = self.simulator.step(flown)
         outcome = self.race.step(path, self.simulator.state.body_rates, invalid)
+        reward = outcome.reward_base
+        if self._tracks_last_action:
+            flown = flown.float().clamp(-1.0, 1.0)
+            change = (flown - self._last_action).square().sum(1).masked_fill(first | outcome.terminated, 0.0)
+            self._last_action.copy_(flown)
+            if self.custom_reward is not None and before is not None:
+                reward = self.custom_reward.rewards(Transition(before, self.race_state(), outcome))
+            if self.action_change_weight:
+                reward = reward - self.action_change_weight * change
         if self.gaze_weight:
-            looked = self._gaze().masked_fill(outcome.terminated, 0.0)
-            outcome = replace(outcome, reward_base=outcome.reward_base + self.gaze_weight * looked)
-        if not self._tracks_last_action:
-            return outcome
-        flown = flown.float().clamp(-1.0, 1.0)
-        change = (flown - self._last_action).square().sum(1).masked_fill(~goes_on | outcome.terminated, 0.0)
-        self._last_action.copy_(flown)
-        if self.custom_reward is not None and before is not None:
-            rewards = self.custom_reward.rewards(Transition(before, self.race_state(), outcome))
-            outcome = replace(outcome, reward_base=rewards)
-        if not self.action_change_weight:
-            return outcome
-        return replace(outcome, reward_base=outcome.reward_base - self.action_change_weight * change)
+            reward = reward + self.gaze_weight * self._gaze().masked_fill(outcome.terminated, 0.0)
+        return replace(outcome, reward_base=reward)
 
     def _gaze(self) -> Tensor:
         """Return the cosine of the angle between each camera's axis and the direction to its target gate, (N,)."""
