@@ -220,8 +220,7 @@ class RaceWorlds:
         check_device(device)
         self.camera, errors = load_camera(camera, camera_rate, from_pixels), load_imu(imu, from_pixels)
         self._process, self._from_pixels = os.getpid(), from_pixels
-        self.track, self.evaluation = load_track(track), evaluation
-        self.num_envs = num_envs = int(num_envs)
+        self.track, self.evaluation, self.num_envs = load_track(track), evaluation, int(num_envs)
         self.parameters = at_control_rate(load_preset(preset), control_rate)
         interval = frame_interval(self.camera, 1.0 / self.parameters.control_dt)
         self._generator = torch.Generator(device)
@@ -229,7 +228,7 @@ class RaceWorlds:
         self.simulator: Simulator = make_simulator(
             self.track,
             self.parameters,
-            num_envs,
+            self.num_envs,
             self.camera,
             renderer if from_pixels else None,
             num_threads,
