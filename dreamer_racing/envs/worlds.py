@@ -160,9 +160,9 @@ class RaceWorlds:
         action_change_weight: b₃, penalty in training per unit of ‖aₜ − aₜ₋₁‖², except in the first step of an episode
             and in a step that ends in a crash; 0 as in the paper. Champion-level drone racing (Kaufmann et al., Nature
             620, 2023, Extended Data Table 1a: λ₅, with λ₁ = 1 per metre of progress, as here) has 1e-4.
-        gaze_weight: b₄, reward in training per step for looking at the target gate: the cosine of the angle δ between the
-            axis of the camera, at its nominal tilt, and the direction to the gate's centre, except in a step that ends
-            in a crash; 0 as in the paper. Kaufmann et al. reward exp(−λ δ⁴), which is flat where the camera looks away.
+        gaze_weight: b₄, reward in training per step for looking at the target gate: the cosine of the angle δ between
+            the axis of the camera, at its nominal tilt, and the direction to the gate's centre, except in a step that
+            ends in a crash; 0 as in the paper. Kaufmann et al. reward exp(−λ δ⁴), flat where it looks away.
         control_rate: actions per second, Hz; None for the preset's, 50.
         camera_rate: frames per second, Hz: `control_rate` divided by a whole number. The image is repeated, not
             rendered again, until the next frame; None for the camera's rate, by default a frame per control step.
