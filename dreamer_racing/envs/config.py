@@ -54,7 +54,7 @@ class EnvConfig:
     miss_radius: float = setting(0.0, NOT_NEGATIVE)
     # b3, penalty in training per unit of |a_t - a_t-1|^2; 0: none, as in the paper; 1e-4 in champion-level racing
     action_change_weight: float = setting(0.0, NOT_NEGATIVE)
-    # b4, reward in training per step for looking at the target gate, times the cosine of the angle; 0 as in the paper
+    # b4, in training each step pays b4 times the cosine of the angle from camera axis to target gate; 0 as in the paper
     gaze_weight: float = setting(0.0, NOT_NEGATIVE)
     # device of the training and evaluation environments: cpu | cuda | auto (the learner's if supported)
     device: str = "auto"
