@@ -133,6 +133,7 @@ class Session:
         self._due: dict[str, bool] = {}  # what is due after this rollout, once asked
         self._saves = False  # whether to save after this rollout
         self._another_follows = False  # whether another rollout is delivered before evaluating or saving
+        self._complete = False  # whether only the last evaluation and the last save are left
 
     @property
     def env_steps(self) -> int:
@@ -271,6 +272,7 @@ class Session:
         """
         if not self._due:
             ready = not self.stopping and not self._another_follows
+            self._complete = ready and self.at_end
             self._due = {
                 each: ready and self._periods.due(each, self.env_steps, self.at_end) for each in ("log", "evaluate")
             }
@@ -377,8 +379,11 @@ class Session:
             self.directory.finished.unlink()  # the run resumes from before its end
 
     def _end(self) -> None:
-        """Save everything, and report how the run ended; a signal that comes during this last save changes nothing."""
-        stopped = self.stopping
+        """Save everything, and report how the run ended.
+
+        A signal that comes during the last evaluation or the last save changes nothing: no update is left to make.
+        """
+        stopped = self.stopping and not self._complete
         saved = self.save()
         if stopped:
             at = f"{Signals(self._signal).name} at {self.env_steps:,} of {self.config.total_env_steps:,} env_steps"

@@ -160,16 +160,19 @@ def test_a_policy_with_updates_left_to_make_is_evaluated_once_a_resumed_run_has_
     assert resumed.go()[0] == ("evaluated", 44) and RunDirectory(tmp_path).finished.exists()
 
 
-def test_a_run_whose_last_save_is_under_way_has_finished_whatever_signal_comes(tmp_path: Path) -> None:
+@pytest.mark.parametrize("last", ["evaluation", "save"])
+def test_a_run_with_nothing_left_to_learn_has_finished_whatever_signal_comes(tmp_path: Path, last: str) -> None:
     run = Run(tmp_path, total=40, rollout=4)
-    save = run.session.checkpoints.save
+    owner, name = (run.session.evaluator, "make") if last == "evaluation" else (run.session.checkpoints, "save")
+    make = getattr(owner, name)
 
-    def interrupted(env_steps: int, *rest: Any) -> Path:
+    def interrupted(*rest: Any) -> Any:
         os.kill(os.getpid(), signal.SIGTERM)
-        return save(env_steps, *rest)
+        return make(*rest)
 
-    run.session.checkpoints.save = interrupted
-    assert ("saved", 44) in run.go() and RunDirectory(tmp_path).finished.exists()
+    setattr(owner, name, interrupted)
+    assert run.go()[0] == ("evaluated", 44) and run.events[-1] == ("saved", 44)
+    assert RunDirectory(tmp_path).finished.exists()
 
 
 def test_what_was_delivered_before_workers_were_lost_is_saved(tmp_path: Path) -> None:
