@@ -260,6 +260,7 @@ class Session:
         """Yield the numbers of ``due`` updates, and count them; stop after a signal (a resumed run makes the rest)."""
         for number in range(due):
             if self.stopping:
+                self._complete = False  # even if the loop asks what is due before its updates
                 return
             yield number
             self.counters["updates"] += 1
