@@ -175,6 +175,20 @@ def test_a_run_with_nothing_left_to_learn_has_finished_whatever_signal_comes(tmp
     assert RunDirectory(tmp_path).finished.exists()
 
 
+def test_a_loop_may_ask_what_is_due_before_its_last_updates_and_is_still_stopped(tmp_path: Path) -> None:
+    run = Run(tmp_path, total=40, rollout=4)
+
+    def ask_and_stop(updates: int) -> None:
+        if updates == 42:  # of 44
+            run.session.due("log")
+            os.kill(os.getpid(), signal.SIGTERM)
+
+    run.on_update = ask_and_stop
+    with pytest.raises(SystemExit):
+        run.go()
+    assert run.learner.updates == 42 and not RunDirectory(tmp_path).finished.exists()
+
+
 def test_what_was_delivered_before_workers_were_lost_is_saved(tmp_path: Path) -> None:
     run = Run(tmp_path, total=40, rollout=4, fails_after=3)
     with pytest.raises(WorkerError):
