@@ -21,7 +21,7 @@ ALL_SUITES = ("suite", "num_envs", "device", "episode_steps", "from_pixels", "im
 MISSING = "???"  # OmegaConf's marker of a mandatory value; this package does not import OmegaConf
 TRAINING_ONLY = (
     "episode_steps", "start_beyond_gate", "start_at_gate", "start_on_line", "miss_radius", "action_change_weight",
-    "gaze_weight", "looks",
+    "looks",
 )  # fmt: skip
 """Settings of training races that evaluation races do not take."""
 
@@ -54,8 +54,6 @@ class EnvConfig:
     miss_radius: float = setting(0.0, NOT_NEGATIVE)
     # b3, penalty in training per unit of |a_t - a_t-1|^2; 0: none, as in the paper; 1e-4 in champion-level racing
     action_change_weight: float = setting(0.0, NOT_NEGATIVE)
-    # b4, in training each step pays b4 times the cosine of the angle from camera axis to target gate; 0 as in the paper
-    gaze_weight: float = setting(0.0, NOT_NEGATIVE)
     # device of the training and evaluation environments: cpu | cuda | auto (the learner's if supported)
     device: str = "auto"
     renderer: str = "auto"  # auto | egl | osmesa | warp | warp_cuda; on cuda auto | warp

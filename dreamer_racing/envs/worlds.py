@@ -34,7 +34,6 @@ from dreamer_racing.envs.race.race import (
 from dreamer_racing.envs.race.racing_line import START_LINE, plan_racing_line
 from dreamer_racing.envs.race.starts import StartSampler
 from dreamer_racing.envs.simulator.looks import LooksRandomisation, load_looks
-from dreamer_racing.envs.simulator.rendering import NoseMount
 from dreamer_racing.envs.simulator.scene import Camera, frame_interval, load_camera
 from dreamer_racing.envs.simulator.simulators import Simulator, check_device, make_simulator
 from dreamer_racing.envs.simulator.warp_device import GraphedFunction
@@ -70,7 +69,6 @@ class RaceOptions(TypedDict, total=False):
     start_noise: float
     miss_radius: float
     action_change_weight: float
-    gaze_weight: float
     control_rate: float | None
     camera_rate: float | None
     imu: str | ImuErrors | None
@@ -160,9 +158,6 @@ class RaceWorlds:
         action_change_weight: b₃, penalty in training per unit of ‖aₜ − aₜ₋₁‖², except in the first step of an episode
             and in a step that ends in a crash; 0 as in the paper. Champion-level drone racing (Kaufmann et al., Nature
             620, 2023, Extended Data Table 1a: λ₅, with λ₁ = 1 per metre of progress, as here) has 1e-4.
-        gaze_weight: b₄, reward in training per step for looking at the target gate: the cosine of the angle δ between
-            the axis of the camera, at its nominal tilt, and the direction to the gate's centre, except in a step that
-            ends in a crash; 0 as in the paper. Kaufmann et al. reward exp(−λ δ⁴), flat where it looks away.
         control_rate: actions per second, Hz; None for the preset's, 50.
         camera_rate: frames per second, Hz: `control_rate` divided by a whole number. The image is repeated, not
             rendered again, until the next frame; None for the camera's rate, by default a frame per control step.
@@ -208,7 +203,6 @@ class RaceWorlds:
         start_noise: float = 0.0,
         miss_radius: float = 0.0,
         action_change_weight: float = 0.0,
-        gaze_weight: float = 0.0,
         control_rate: float | None = None,
         camera_rate: float | None = None,
         imu: str | ImuErrors | None = None,
@@ -240,7 +234,7 @@ class RaceWorlds:
         self.device, self.dtype = self.simulator.device, self.simulator.dtype
         self.race = self._make_race(weights, episode_steps, miss_radius)
         self._make_numbers(errors, vector)
-        self._make_rewards(action_change_weight, gaze_weight, reward)
+        self._make_rewards(action_change_weight, reward)
         self._starts = self._make_starts(start_beyond_gate, start_at_gate, start_noise, start_on_line)
         self._held = FrameHold(interval, self._draw) if from_pixels and interval > 1 else None
         self._graphs: dict[bool, GraphedFunction] = {}  # CUDA graphs of a control step, by whether it renders
@@ -273,13 +267,10 @@ class RaceWorlds:
             self.custom_vector = CustomFunction("vector", vector, self.num_envs, self.device)
             self.vector_size = self.observed_vector().shape[1]
 
-    def _make_rewards(self, change: float, gaze: float, reward: str | RewardFunction | None) -> None:
-        """Set b₃ and b₄, which apply only in training, and the user-defined reward function, if any."""
+    def _make_rewards(self, change: float, reward: str | RewardFunction | None) -> None:
+        """Set b₃, which applies only in training, and the user-defined reward function, if any."""
         check_setting("action_change_weight", change, NOT_NEGATIVE)
-        check_setting("gaze_weight", gaze, NOT_NEGATIVE)
         self.action_change_weight = 0.0 if self.evaluation else float(change)
-        self.gaze_weight = 0.0 if self.evaluation else float(gaze)
-        self._nose = NoseMount(self.camera, self.device, self.dtype)
         self.custom_reward = None if reward is None else CustomFunction("reward", reward, self.num_envs, self.device)
         self._tracks_last_action = bool(self.action_change_weight or self.custom_reward or self.custom_vector)
 
@@ -390,25 +381,16 @@ class RaceWorlds:
         before = None if self.custom_reward is None else self.race_state()
         path = self.simulator.step(flown)
         outcome = self.race.step(path, self.simulator.state.body_rates, invalid)
-        reward = outcome.reward_base
-        if self._tracks_last_action:
-            flown = flown.float().clamp(-1.0, 1.0)
-            change = (flown - self._last_action).square().sum(1).masked_fill(first | outcome.terminated, 0.0)
-            self._last_action.copy_(flown)
-            if self.custom_reward is not None and before is not None:
-                reward = self.custom_reward.rewards(Transition(before, self.race_state(), outcome))
-            if self.action_change_weight:
-                reward = reward - self.action_change_weight * change
-        if self.gaze_weight:
-            reward = reward + self.gaze_weight * self._gaze().masked_fill(outcome.terminated, 0.0)
+        if not self._tracks_last_action:
+            return outcome
+        reward, flown = outcome.reward_base, flown.float().clamp(-1.0, 1.0)
+        change = (flown - self._last_action).square().sum(1).masked_fill(first | outcome.terminated, 0.0)
+        self._last_action.copy_(flown)
+        if self.custom_reward is not None and before is not None:
+            reward = self.custom_reward.rewards(Transition(before, self.race_state(), outcome))
+        if self.action_change_weight:
+            reward = reward - self.action_change_weight * change
         return replace(outcome, reward_base=reward)
-
-    def _gaze(self) -> Tensor:
-        """Return the cosine of the angle between each camera's axis and the direction to its target gate, (N,)."""
-        state = self.simulator.state
-        eye, axes = self._nose(state.position, state.attitude)
-        gate = self.race.gate_positions[self.race.target_gate]
-        return torch.cosine_similarity(gate - eye, -axes[:, 2], dim=-1).nan_to_num(0.0).float()
 
     def _capture(self, action: Tensor, draws: bool) -> GraphedFunction:
         """Capture the physics, race rules and, if ``draws``, rendering of a step as one CUDA graph; restore the worlds.
