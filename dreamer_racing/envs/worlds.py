@@ -267,10 +267,10 @@ class RaceWorlds:
             self.custom_vector = CustomFunction("vector", vector, self.num_envs, self.device)
             self.vector_size = self.observed_vector().shape[1]
 
-    def _make_rewards(self, change: float, reward: str | RewardFunction | None) -> None:
+    def _make_rewards(self, action_change_weight: float, reward: str | RewardFunction | None) -> None:
         """Set b₃, which applies only in training, and the user-defined reward function, if any."""
-        check_setting("action_change_weight", change, NOT_NEGATIVE)
-        self.action_change_weight = 0.0 if self.evaluation else float(change)
+        check_setting("action_change_weight", action_change_weight, NOT_NEGATIVE)
+        self.action_change_weight = 0.0 if self.evaluation else float(action_change_weight)
         self.custom_reward = None if reward is None else CustomFunction("reward", reward, self.num_envs, self.device)
         self._tracks_last_action = bool(self.action_change_weight or self.custom_reward or self.custom_vector)
 
@@ -377,12 +377,12 @@ class RaceWorlds:
         """Simulate one control step and apply the race rules, without synchronising with a CUDA device."""
         invalid = ~action.isfinite().all(dim=1)
         flown = action.nan_to_num(0.0, 0.0, 0.0)
-        first = self.race.step_count == 0  # the first step of an episode has no previous action
         before = None if self.custom_reward is None else self.race_state()
         path = self.simulator.step(flown)
         outcome = self.race.step(path, self.simulator.state.body_rates, invalid)
         if not self._tracks_last_action:
             return outcome
+        first = self.race.step_count == 1  # no previous action
         reward, flown = outcome.reward_base, flown.float().clamp(-1.0, 1.0)
         change = (flown - self._last_action).square().sum(1).masked_fill(first | outcome.terminated, 0.0)
         self._last_action.copy_(flown)
