@@ -48,7 +48,7 @@ How well each algorithm flies here, what that took, and the command that runs it
 - **Without the true state** latent PPO (100 %, two seeds) and DreamerV3 race Circle. Five seeds of
   DreamerV3 ended at 91 to 99 % after 125 to 148 minutes (two with settings that were changed on the way; one had 71 %
   six minutes before its end). All had 90 % after 80 to 106 minutes, and swing. On Kidney none of five runs of DreamerV3
-  raced: 0.9 to 2.0 of 18 gates, all cut short. In some [the drone spins](#dreamerv3-without-the-true-state).
+  raced: 0.9 to 2.1 of 18 gates, all cut short. In some [the drone spins](#dreamerv3-without-the-true-state).
 - **PPO from the true state** flies three clean laps after 3 to 11 minutes.
 
 ## How success is measured
