@@ -43,8 +43,9 @@ How well each algorithm flies here, what that took, and the command that runs it
   state in training it races all three tracks: 97 to 100 %, two seeds each, trained for 79 to 84 minutes on one core
   (one run of Circle for 33, on an AMD EPYC in bfloat16). Split-S: 92 %, one seed.
 - **DreamerV3** learns in imagination. Today's default raced all three tracks: Circle (two seeds: 99 %), Kidney (one:
-  100 %; nearly the same another) and Figure 8 (one: 99 %). So did the one before, *C*: Circle (two), Kidney (one;
-  another was cut short) and Figure 8 (one complete run): 100 %. They had 90 % after 27 to 90 minutes.
+  100 %; nearly the same another) and Figure 8 (one: 99 %; another was just begun). So did the one before, *C*: Circle
+  (two), Kidney (one; another was cut short) and Figure 8 (one complete run): 100 %. They had 90 % after 27 to 90
+  minutes.
 - **Without the true state** latent PPO (100 %, two seeds) and DreamerV3 race Circle. Five seeds of
   DreamerV3 ended at 91 to 99 % after 125 to 148 minutes (two with settings that were changed on the way; one had 71 %
   six minutes before its end). All had 90 % after 80 to 106 minutes, and swing. On Kidney none of five runs of DreamerV3
