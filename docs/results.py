@@ -43,9 +43,9 @@ How well each algorithm flies here, what that took, and the command that runs it
   state in training it races all three tracks: 97 to 100 %, two seeds each, trained for 79 to 84 minutes on one core
   (one run of Circle for 33, on an AMD EPYC in bfloat16). Split-S: 92 %, one seed.
 - **DreamerV3** learns in imagination. Today's default raced all three tracks: Circle (two seeds: 99 %), Kidney (one:
-  100 %; nearly the same another) and Figure 8 (one: 99 %; another was just begun). So did the one before, *C*: Circle
-  (two), Kidney (one; another was cut short) and Figure 8 (one complete run): 100 %. They had 90 % after 27 to 90
-  minutes.
+  100 %; nearly the same another) and Figure 8 (two: 99 and 100 %; the second swings). So did the one before, *C*:
+  Circle (two), Kidney (one; another was cut short) and Figure 8 (one complete run): 100 %. They had 90 % after 27 to
+  111 minutes.
 - **Without the true state** latent PPO (100 %, two seeds) and DreamerV3 race Circle. Five seeds of
   DreamerV3 ended at 91 to 99 % after 125 to 148 minutes (two with settings that were changed on the way; one had 71 %
   six minutes before its end). All had 90 % after 80 to 106 minutes, and swing. On Kidney none of five runs of DreamerV3
@@ -85,7 +85,7 @@ SURE = """## How sure, and what is not shown
 - **Flights.** Of 100, 100 % means 96 to 100 %, 97 % 92 to 99 %, 93 % 86 to 97 % (95 % intervals), for *this* agent.
 - **Seeds.** One to three runs do not say how the next one goes. Kidney 1 was far behind when cut short, by B and C.
 - **Selection.** Settings were chosen on these tracks, DreamerV3's on B's Circle, A's Figure 8, C's Kidney 1.
-- **Not shown:** a real drone; complete runs of DreamerV3 but Figure 8's by A and C; agents of images alone but on
+- **Not shown:** a real drone; complete runs of DreamerV3 but Figure 8's by A, C and today's; agents of images alone but on
   Circle; today's settings on a GPU; the paper's 20 million env_steps. The gate coordinates are this project's own, so
   the paper's numbers cannot be compared. [More](what_we_know.md#what-is-not-known).
 - **Commands** below use today's defaults; for A, B and C take the originals (*Commands, commits, machine*).
