@@ -64,13 +64,15 @@ class DreamerV3(WorldModelLearner):
         )
         self.action_change_scale = torch.tensor(float(losses.action_change_scale), device=device)
         self.crash_weight = torch.tensor(float(losses.crash_weight), device=device)
-        self._actor_learns = torch.ones((), device=device)  # 0 or 1; a tensor, so that a captured CUDA graph reads it
         super().__init__(agent, losses, config)
 
     def update(self, batch: TensorDictBase, timed: Timer = untimed) -> dict[str, Tensor]:
         """Make one gradient step for all networks; see `WorldModelLearner.update`."""
-        self._actor_learns.fill_(self.updates >= self.loss_config.actor_begin)
+        waits = self.updates < self.loss_config.actor_begin
+        before = [parameter.detach().clone() for parameter in self._trained["actor"]] if waits else []
         metrics = self.gradient_step(batch, timed)
+        if waits:  # undone rather than left out: the optimiser must know the gradient's scale when the actor begins
+            torch._foreach_copy_([parameter.detach() for parameter in self._trained["actor"]], before)
         self.average_weights()
         return metrics
 
@@ -138,7 +140,7 @@ class DreamerV3(WorldModelLearner):
             objective, metrics = self.objective(trajectory, entropy_scale=self.entropy_scale)
             change = trajectory.action_change()
             objective = objective + self.action_change_scale * change
-            losses |= metrics | {"loss_actor": self._actor_learns * objective, "action_change": change.detach()}
+            losses |= metrics | {"loss_actor": objective, "action_change": change.detach()}
 
             # Critic: two-hot regression on the λ-returns of replayed and of imagined steps (Eq. 10). If every record
             # was a start, replayed returns bootstrap from its imagined return, which is better than the critic's value.

@@ -89,6 +89,23 @@ def test_the_actor_begins_after_so_many_updates(actor):
         assert any(moved) == begun
 
 
+@pytest.mark.parametrize("actor", ["reinforce", "dynamics"])
+def test_the_actor_begins_with_steps_no_larger_than_those_of_one_that_has_not_waited(actor):
+    first_steps = []
+    for begin in (0, 80):
+        learner = learner_of(actor=actor, actor_begin=begin, seed=0, **CONFIG)
+        learner.optimizer.param_groups[0]["lr"] = 0.0  # the model stays, so that gradients do
+        batch = make_batch()
+        for _ in range(80):
+            learner.update(batch)
+        before = [parameter.clone() for parameter in learner.agent.actor.parameters()]
+        for _ in range(3):
+            learner.update(batch)
+        after = learner.agent.actor.parameters()
+        first_steps.append(sum((a - b).square().sum() for a, b in zip(after, before, strict=True)).sqrt())
+    assert first_steps[1] < 1.1 * first_steps[0]
+
+
 def made_with(seed, loss="reconstruction", **interface):
     if any(PRIVILEGED in target.reads for target in TARGETS[loss]):
         interface["privileged_dim"] = 21
