@@ -42,10 +42,10 @@ How well each algorithm flies here, what that took, and the command that runs it
 - **Use latent PPO**: `OMP_NUM_THREADS=1 ./dev python recipes/latent_ppo.py track=figure8 device=cpu`. With the true
   state in training it races all three tracks: 97 to 100 %, two seeds each, trained for 79 to 84 minutes on one core
   (one run of Circle for 33, on an AMD EPYC in bfloat16). Split-S: 92 %, one seed.
-- **DreamerV3** learns in imagination. Today's default raced all three tracks: Circle (two seeds: 99 %), Kidney (one:
-  100 %; nearly the same another) and Figure 8 (two: 99 and 100 %; the second swings). So did the one before, *C*:
-  Circle (two), Kidney (one; another was cut short) and Figure 8 (one complete run): 100 %. They had 90 % after 27 to
-  111 minutes.
+- **DreamerV3** learns in imagination. Today's default raced all three tracks, by two seeds each: Circle (99 %), Kidney
+  (100 %; a third run by nearly the same) and Figure 8 (99 and 100 %; the second swings). So did the one before,
+  *C*: Circle (two), Kidney (one; another was cut short) and Figure 8 (one complete run): 100 %. They had 90 % after
+  27 to 111 minutes.
 - **Without the true state** latent PPO (100 %, two seeds) and DreamerV3 race Circle. Five seeds of
   DreamerV3 ended at 91 to 99 % after 125 to 148 minutes (two with settings that were changed on the way; one had 71 %
   six minutes before its end). All had 90 % after 80 to 106 minutes, and swing. On Kidney none of five runs of DreamerV3
