@@ -63,6 +63,8 @@ class DreamerV3(WorldModelLearner):
             device
         )
         self.action_change_scale = torch.tensor(float(losses.action_change_scale), device=device)
+        self.averaged_kl_scale = torch.tensor(float(losses.averaged_kl_scale), device=device)
+        self._stays_near_average = losses.averaged_kl_scale > 0
         self.crash_weight = torch.tensor(float(losses.crash_weight), device=device)
         super().__init__(agent, losses, config)
 
@@ -138,9 +140,8 @@ class DreamerV3(WorldModelLearner):
                 scale=scale,
             )
             objective, metrics = self.objective(trajectory, entropy_scale=self.entropy_scale)
-            change = trajectory.action_change()
-            objective = objective + self.action_change_scale * change
-            losses |= metrics | {"loss_actor": objective, "action_change": change.detach()}
+            penalty, measured = self.policy_penalty(trajectory)
+            losses |= metrics | measured | {"loss_actor": objective + penalty}
 
             # Critic: two-hot regression on the λ-returns of replayed and of imagined steps (Eq. 10). If every record
             # was a start, replayed returns bootstrap from its imagined return, which is better than the critic's value.
@@ -161,11 +162,31 @@ class DreamerV3(WorldModelLearner):
                 "value_error": (expected - returns).abs().mean(),
             }
 
+    def policy_penalty(self, trajectory: Trajectory) -> tuple[Tensor, dict[str, Tensor]]:
+        """Return what is added to any objective, a scalar, and metrics.
+
+        It is the weighted sum of the policy's change from step to step and, if turned on, of KL(averaged ‖ current).
+
+        Raises:
+            ValueError: If the divergence from the averaged policy is turned on, and no averaged weights are kept.
+        """
+        change = trajectory.action_change()
+        penalty, metrics = self.action_change_scale * change, {"action_change": change.detach()}
+        if not self._stays_near_average:
+            return penalty, metrics
+        if self.averaged is None:
+            raise ValueError("loss.averaged_kl_scale needs averaged weights: set model.average_rate, such as to 0.005.")
+        with torch.no_grad():
+            averaged = self.averaged.actor(trajectory.features)
+        divergence = trajectory.mean(averaged.divergence(trajectory.policy))
+        return penalty + self.averaged_kl_scale * divergence, metrics | {"averaged_kl": divergence.detach()}
+
     def adjust(
         self,
         *,
         imagination_horizon: float | None = None,
         action_change_scale: float | None = None,
+        averaged_kl_scale: float | None = None,
         crash_weight: float | None = None,
         **numbers: Any,
     ) -> None:
@@ -174,11 +195,14 @@ class DreamerV3(WorldModelLearner):
         Args:
             imagination_horizon: H, rounded; if it changes, the CUDA graph is captured again.
             action_change_scale: Weight of the changes of the policy's mean from step to step.
+            averaged_kl_scale: Weight of the policy's divergence from that of the averaged weights.
             crash_weight: Power of the predicted probability that an imagined episode continues.
             numbers: Arguments of `WorldModelLearner.adjust`.
         """
         super().adjust(**numbers)
         fill_given((self.action_change_scale, action_change_scale), (self.crash_weight, crash_weight))
+        fill_given((self.averaged_kl_scale, averaged_kl_scale))
+        self._stays_near_average = self._stays_near_average or averaged_kl_scale is not None
         if imagination_horizon is not None and round(imagination_horizon) != self.horizon:
             self.horizon = round(imagination_horizon)
             if self._graph is not None:

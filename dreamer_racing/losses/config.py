@@ -109,6 +109,9 @@ class DreamerV3Losses(LossConfig):
             imagination (`open_loop_loss`). 0, as in the reference, learns them only at observed latents.
         action_change_scale: Weight of the squared change of the policy's mean from one imagined step to the next
             (`Trajectory.action_change`) in the actor's loss; the reference has none.
+        averaged_kl_scale: Weight of KL(averaged ‖ current), the divergence of the policy from that of the averaged
+            weights, in the actor's loss; needs ``model.average_rate``. An actor that races then follows errors of its
+            world model more slowly. The reference has none; Vieillard et al. 2020, "Leverage the average", analyse it.
         crash_weight: Power of the predicted probability that an imagined episode continues: a small risk of a crash
             counts this many times, and the actor flies with more caution. Values are then below the
             expected returns. The reference has 1.
@@ -121,6 +124,7 @@ class DreamerV3Losses(LossConfig):
     continuation: bool = True
     open_loop_steps: int = setting(0, NOT_NEGATIVE)
     action_change_scale: float = setting(0.0, NOT_NEGATIVE)
+    averaged_kl_scale: float = setting(0.0, NOT_NEGATIVE)
     crash_weight: float = setting(1.0, Range(1))
     actor_begin: int = setting(0, NOT_NEGATIVE)
 

@@ -150,6 +150,7 @@ class DreamerV3ScheduleConfig(ScheduleConfig):
 
     imagination_horizon: Ramp = field(default_factory=Ramp)  # model.imagination_horizon, rounded
     action_change_scale: Ramp = field(default_factory=Ramp)  # loss.action_change_scale
+    averaged_kl_scale: Ramp = field(default_factory=Ramp)  # loss.averaged_kl_scale
     crash_weight: Ramp = field(default_factory=Ramp)  # loss.crash_weight
 
 

@@ -539,6 +539,27 @@ def test_changes_of_the_policy_are_measured_and_cost_what_is_set():
     assert first_update({"action_change_scale": 100.0})["loss_actor"] == dear["loss_actor"]
 
 
+def test_the_divergence_from_the_averaged_policy_costs_what_is_set():
+    kept = {"average_rate": 0.1}
+    free = first_update(stirred=True, **kept)
+    near, far = (first_update(stirred=moved, averaged_kl_scale=3.0, **kept) for moved in (False, True))
+    assert "averaged_kl" not in free and near["averaged_kl"] == 0 < far["averaged_kl"]
+    torch.testing.assert_close(far["loss_actor"], free["loss_actor"] + 3.0 * far["averaged_kl"])
+    assert first_update({"averaged_kl_scale": 3.0}, stirred=True, **kept)["loss_actor"] == far["loss_actor"]
+    with pytest.raises(ValueError, match="needs averaged weights: set model.average_rate"):
+        first_update({"averaged_kl_scale": 3.0})
+
+
+def test_an_actor_returns_to_the_averaged_policy_if_that_is_all_that_counts():
+    learner = learner_of(seed=0, **CONFIG, average_rate=1e-6, averaged_kl_scale=1e4)
+    learner.update(make_batch())
+    with torch.no_grad():
+        for parameter in learner.agent.actor.parameters():
+            parameter.add_(0.05 * torch.randn(parameter.shape, generator=torch.Generator().manual_seed(0)))
+    away = [float(learner.update(make_batch())["averaged_kl"]) for _ in range(40)]
+    assert away[-1] < 0.2 * away[0]
+
+
 def test_a_crash_weighs_what_is_set():
     once, twice = (first_update(stirred=True, crash_weight=weight) for weight in (1.0, 2.0))
     assert once["continuation"] == twice["continuation"] < 1

@@ -152,6 +152,7 @@ def test_what_would_be_ignored_is_refused(overrides: list[str], words: str) -> N
         (["replay.recent_records=9"], "replay.recent_records=9 is for replay.recent_share above 0"),
         (["replay.storage=memmap", "replay.device=cpu"], "replay.device=cpu is for replay.storage=tensor"),
         (["loss.continuation=false", "loss.crash_weight=4"], "crash_weight=4.* is for loss.continuation=true, which"),
+        (["tuned=none", "loss.averaged_kl_scale=0.3"], "averaged_kl_scale=0.3 is for averaged weights"),
         (["schedule.wait_every=9"], "wait_every=9 is for schedule.wait_for_model, which is not chosen"),
     ],
 )
