@@ -165,7 +165,8 @@ class DreamerV3(WorldModelLearner):
     def policy_penalty(self, trajectory: Trajectory) -> tuple[Tensor, dict[str, Tensor]]:
         """Return what is added to any objective, a scalar, and metrics.
 
-        It is the weighted sum of the policy's change from step to step and, if turned on, of KL(averaged ‖ current).
+        It is the weighted sum of the policy's change from step to step and, if turned on, of KL(averaged ‖ current):
+        the divergence from the averaged actor, at the same latents of the current world model.
 
         Raises:
             ValueError: If the divergence from the averaged policy is turned on, and no averaged weights are kept.
@@ -195,18 +196,20 @@ class DreamerV3(WorldModelLearner):
         Args:
             imagination_horizon: H, rounded; if it changes, the CUDA graph is captured again.
             action_change_scale: Weight of the changes of the policy's mean from step to step.
-            averaged_kl_scale: Weight of the policy's divergence from that of the averaged weights.
+            averaged_kl_scale: Weight of the policy's divergence from that of the averaged weights; the first time it is
+                given, the graph is captured again, too.
             crash_weight: Power of the predicted probability that an imagined episode continues.
             numbers: Arguments of `WorldModelLearner.adjust`.
         """
         super().adjust(**numbers)
         fill_given((self.action_change_scale, action_change_scale), (self.crash_weight, crash_weight))
         fill_given((self.averaged_kl_scale, averaged_kl_scale))
-        self._stays_near_average = self._stays_near_average or averaged_kl_scale is not None
-        if imagination_horizon is not None and round(imagination_horizon) != self.horizon:
-            self.horizon = round(imagination_horizon)
-            if self._graph is not None:
-                self._graph = self._make_graph()
+        horizon = self.horizon if imagination_horizon is None else round(imagination_horizon)
+        near = self._stays_near_average or averaged_kl_scale is not None
+        changed = (horizon, near) != (self.horizon, self._stays_near_average)
+        self.horizon, self._stays_near_average = horizon, near
+        if changed and self._graph is not None:
+            self._graph = self._make_graph()
 
     @property
     def modules(self) -> nn.ModuleDict:

@@ -110,8 +110,8 @@ class DreamerV3Losses(LossConfig):
         action_change_scale: Weight of the squared change of the policy's mean from one imagined step to the next
             (`Trajectory.action_change`) in the actor's loss; the reference has none.
         averaged_kl_scale: Weight of KL(averaged ‖ current), the divergence of the policy from that of the averaged
-            weights, in the actor's loss; needs ``model.average_rate``. An actor that races then follows errors of its
-            world model more slowly. The reference has none; Vieillard et al. 2020, "Leverage the average", analyse it.
+            weights, in the actor's loss; needs ``model.average_rate``. It is meant to make the actor follow errors
+            of its world model more slowly. The reference has none. Vieillard et al. 2020, "Leverage the average".
         crash_weight: Power of the predicted probability that an imagined episode continues: a small risk of a crash
             counts this many times, and the actor flies with more caution. Values are then below the
             expected returns. The reference has 1.

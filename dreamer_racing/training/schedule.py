@@ -153,6 +153,16 @@ class DreamerV3ScheduleConfig(ScheduleConfig):
     averaged_kl_scale: Ramp = field(default_factory=Ramp)  # loss.averaged_kl_scale
     crash_weight: Ramp = field(default_factory=Ramp)  # loss.crash_weight
 
+    def check(self, owners: Mapping[str, Any], suite: str = "race") -> None:
+        """Check as `ScheduleConfig.check` does, and that there are averaged weights if the policy is held near them."""
+        super().check(owners, suite)
+        largest = max(owners["loss"].averaged_kl_scale, self.averaged_kl_scale.to or 0.0)
+        if largest > 0 and owners["model"].average_rate is None:
+            raise ValueError(
+                f"loss.averaged_kl_scale of up to {largest:g} needs averaged weights: set model.average_rate, such as "
+                "to 0.005."
+            )
+
 
 @dataclass
 class LatentPPOScheduleConfig(ScheduleConfig):

@@ -111,7 +111,10 @@ def check_overrides(config: DictConfig, overrides: Sequence[str]) -> None:
 
 
 def check_read(config: DictConfig, overrides: Sequence[str]) -> None:
-    """Refuse overrides, as the user wrote them, that nothing chosen reads; losses of the user's own may read all."""
+    """Refuse overrides, as the user wrote them, that the chosen losses and replay do not read.
+
+    Losses of the user's own may read all; settings from the file of a group are not refused.
+    """
     targets = find_targets(config.loss.world_model)
 
     def have(reader: type[Target]) -> bool:
@@ -127,7 +130,6 @@ def check_read(config: DictConfig, overrides: Sequence[str]) -> None:
         ("loss.barlow_scale", have(Barlow), "loss=decoder_free"),
         ("model.imagination_starts", config.algorithm == "dreamer_v3", "recipes/dreamer_v3.py, which imagines"),
         ("model.imagination_every", config.algorithm == "dreamer_v3", "recipes/dreamer_v3.py, which imagines"),
-        ("loss.averaged_kl_scale", config.model.average_rate, "averaged weights (model.average_rate)"),
         ("loss.crash_weight", config.loss.get("continuation", True), "loss.continuation=true"),
         ("loss.drift_scale", drift, "stored latents (replay.context=true) without sampling (model.sampled=false)"),
         ("replay.recent_records", config.replay.recent_share > 0, "replay.recent_share above 0"),

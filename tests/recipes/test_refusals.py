@@ -19,6 +19,8 @@ def test_a_person_gets_a_plain_error(override: str, tmp_path: Path) -> None:
 
 REFUSED = [
     (["track=monza"], ["monza", "kidney"]),
+    (["tuned=none", "loss.averaged_kl_scale=0.3"], ["averaged_kl_scale of up to 0.3", "set model.average_rate"]),
+    (["tuned=none", "schedule.averaged_kl_scale.to=0.3"], ["averaged_kl_scale of up to 0.3", "set model.average_rate"]),
     (["env.preset=esay"], ["env.preset=esay", "did you mean easy?", "faithful"]),
     (["env.renderer=directx", "env.from_pixels=true"], ["directx", "egl"]),
     (["device=cuda:7"], ["cuda:7", "cpu"]),
@@ -152,7 +154,6 @@ def test_what_would_be_ignored_is_refused(overrides: list[str], words: str) -> N
         (["replay.recent_records=9"], "replay.recent_records=9 is for replay.recent_share above 0"),
         (["replay.storage=memmap", "replay.device=cpu"], "replay.device=cpu is for replay.storage=tensor"),
         (["loss.continuation=false", "loss.crash_weight=4"], "crash_weight=4.* is for loss.continuation=true, which"),
-        (["tuned=none", "loss.averaged_kl_scale=0.3"], "averaged_kl_scale=0.3 is for averaged weights"),
         (["schedule.wait_every=9"], "wait_every=9 is for schedule.wait_for_model, which is not chosen"),
     ],
 )
