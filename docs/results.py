@@ -85,8 +85,8 @@ SURE = """## How sure, and what is not shown
 - **Flights.** Of 100, 100 % means 96 to 100 %, 97 % 92 to 99 %, 93 % 86 to 97 % (95 % intervals), for *this* agent.
 - **Seeds.** One to three runs do not say how the next one goes. Kidney 1 was far behind when cut short, by B and C.
 - **Selection.** Settings were chosen on these tracks, DreamerV3's on B's Circle, A's Figure 8, C's Kidney 1.
-- **Not shown:** a real drone; complete runs of DreamerV3 but Figure 8's by A, C and today's and one of Kidney by B;
-  agents of images alone but on Circle; today's settings on a GPU; the paper's 20 million env_steps. The gate
+- **Not shown:** a real drone; agents of images alone but on Circle; today's settings on a GPU; the paper's 20 million
+  env_steps. Of DreamerV3 only Figure 8's runs by A, C and today's and one of Kidney by B are complete. The gate
   coordinates are this project's own, so the paper's numbers cannot be compared.
   [More](what_we_know.md#what-is-not-known).
 - **Commands** below use today's defaults; for A, B and C take the originals (*Commands, commits, machine*).

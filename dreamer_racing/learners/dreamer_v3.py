@@ -165,8 +165,8 @@ class DreamerV3(WorldModelLearner):
     def policy_penalty(self, trajectory: Trajectory) -> tuple[Tensor, dict[str, Tensor]]:
         """Return what is added to any objective, a scalar, and metrics.
 
-        It is the weighted sum of the policy's change from step to step and, if turned on, of KL(averaged ‖ current):
-        the divergence from the averaged actor, at the same latents of the current world model.
+        It is the weighted sum of the policy's change from step to step and, if turned on, of KL(averaged ‖ current),
+        nats: the divergence from the averaged actor, at the same latents of the current world model.
 
         Raises:
             ValueError: If the divergence from the averaged policy is turned on, and no averaged weights are kept.
