@@ -40,7 +40,7 @@ HEAD = """# Results
 How well each algorithm flies here, what that took, and the command that runs it again. In short:
 
 - **Latent PPO is the surest** (`recipes/latent_ppo.py`): with the true state in training it races all three tracks.
-- **DreamerV3** (`recipes/dreamer_v3.py`) learns in imagination and, with the true state in training, races them, too, by
+- **DreamerV3** (`recipes/dreamer_v3.py`) learns in imagination. With the true state in training it races them, too, by
   every seed of today's default. Success dips on the way, most on Figure 8.
 - **From images alone** both race Circle. DreamerV3 swings there, and has not raced Kidney, for reasons that are [partly
   known](kidney_from_images.md).
