@@ -79,7 +79,7 @@ def train(config: DreamerV3RunConfig, session: Session) -> None:
             with session.timed("sample"):
                 batch = replay.sample()
             session.log(learner.update(batch, session.timed))
-            if config.replay.context and learner.latents is not None:
+            if config.replay.context:
                 replay.refresh(batch["index"], learner.latents["belief"], learner.latents["state"])
 
         # Evaluate, log and save.

@@ -92,7 +92,7 @@ def train(config: LatentPPORunConfig, session: Session) -> None:
             metrics = learner.update(batch, session.timed)
             session.log(metrics)
             lag.add_training_error(metrics)
-            if config.replay.context and learner.latents is not None:  # later windows begin with these latents
+            if config.replay.context:  # later windows begin with these latents
                 replay.refresh(batch["index"], learner.latents["belief"], learner.latents["state"])
 
         # Evaluate, log and save.

@@ -32,9 +32,8 @@ def measure(
     session: Session, learner: WorldModelLearner, replay: StreamReplay, scheduled: Mapping[str, float]
 ) -> dict[str, Tensor | float]:
     """Return a run's current hyperparameters, and `held_out_metrics` on the newest held-out records."""
-    groups = zip(("world_model", "behavior"), learner.optimizer.param_groups, strict=True)
     numbers: dict[str, Any] = {f"schedule/{name}": value for name, value in scheduled.items()}
-    numbers |= {f"learning_rate/{name}": group["lr"] for name, group in groups}
+    numbers |= {f"learning_rate/{name}": rate for name, rate in learner.learning_rates.items()}
     windows = replay.held_out(WINDOWS, SEEN + learner.config.imagination_horizon, RECORDS)
     if windows is None or not session.counters["updates"]:
         return numbers

@@ -29,8 +29,9 @@ class LearnerConfig:
         mixed_precision: Compute the losses under bfloat16 autocast; parameters, logits and losses stay float32. The
             recipes replace None by whether the device gains by it; otherwise None means False.
         learning_rate: Learning rate. The reference's 4e-5 suits large models; small ones learn faster at 1e-4 to 3e-4.
-        behavior_learning_rate: Learning rate of actor and critic; None for the same. A lower one gives the world model
-            a lead over a policy that exploits its errors; the 2023 code had 3e-5 beside 1e-4.
+        behavior_learning_rate: Learning rate of actor and critic, in latent PPO only of the critic that shapes the
+            latents; None for the same. A lower one gives the world model a lead over a policy that exploits its errors;
+            the 2023 code had 3e-5 beside 1e-4.
         warmup_updates: Updates over which the learning rate rises from zero.
 
     Reference: danijar/dreamerv3, ``configs.yaml``.

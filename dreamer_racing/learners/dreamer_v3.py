@@ -122,7 +122,7 @@ class DreamerV3(WorldModelLearner):
             start = 1.0 - starts.terminated.to(discount.dtype).unsqueeze(0)
             weight = torch.cat((start, discount[:-1].detach())).cumprod(0)
             self.return_range.update(parallel.all_gather(returns.detach(), dim=1))
-            scale = self.return_range.scale()
+            scale = self.return_range.scale().squeeze(-1)
 
             # Actor: the objective on the imagined steps, with detached features (Eq. 11).
             features = imagined[:-1].detach()  # (H, N, F)
@@ -140,6 +140,8 @@ class DreamerV3(WorldModelLearner):
                 scale=scale,
             )
             objective, metrics = self.objective(trajectory, entropy_scale=self.entropy_scale)
+            if wrong := [name for name in metrics if name.startswith("loss")]:
+                raise ValueError(f"loss.actor: the metric {wrong[0]!r} would be added to the losses: rename it.")
             penalty, measured = self.policy_penalty(trajectory)
             losses |= metrics | measured | {"loss_actor": objective + penalty}
 
@@ -155,7 +157,7 @@ class DreamerV3(WorldModelLearner):
             expected = critic.two_hot.decode(logits)
             return losses | {
                 "return_mean": returns.mean(),
-                "return_scale": scale.squeeze(-1),
+                "return_scale": scale,
                 "imagined_reward": reward.mean(),
                 "continuation": goes_on.mean(),
                 "value_mean": expected.mean(),

@@ -24,10 +24,24 @@ def gradient_norms(networks: Mapping[str, list[nn.Parameter]]) -> dict[str, Tens
 
 def restore(optimizer: torch.optim.Optimizer, state: dict[str, Any]) -> None:
     """Restore an optimiser's state, but keep its own settings: a run may resume with other rates or another device."""
-    names = {"lr", "warmup_steps", "fused"}
-    own = [{name: value for name, value in group.items() if name in names} for group in optimizer.param_groups]
-    groups = [{**group, **settings} for group, settings in zip(state["param_groups"], own, strict=True)]
+    saved = {index: group for group in state["param_groups"] for index in group["params"]}
+    groups = []
+    for own in optimizer.state_dict()["param_groups"]:
+        kept = {name: own[name] for name in ("params", "lr", "warmup_steps", "fused") if name in own}
+        groups.append({**saved[own["params"][0]], **kept})  # a saved group may have been split since
     optimizer.load_state_dict({**state, "param_groups": groups})
+
+
+def step_with_gradients(optimizer: torch.optim.Optimizer) -> None:
+    """Make a step of the parameter groups that have gradients.
+
+    TorchRL's optimiser counts a step of the others, too. An actor that learns in every n-th update would then have its
+    moments corrected for n times too many steps, so that its own steps would be too large.
+    """
+    idle = [group for group in optimizer.param_groups if all(each.grad is None for each in group["params"])]
+    optimizer.step()
+    for group in idle:
+        group["step"] -= 1
 
 
 class NonFiniteLossError(RuntimeError):

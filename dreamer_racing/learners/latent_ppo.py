@@ -235,6 +235,14 @@ class LatentPPO(WorldModelLearner):
         if kl_target is not None:
             self.actor_update.kl_target = kl_target
 
+    @property
+    def learning_rates(self) -> dict[str, float]:
+        """Current learning rates by what they train; the actor's without the factor that ``kl_target`` sets."""
+        world_model, latent_critic = super().learning_rates.values()
+        updates = {"actor": self.actor_update, "critic": self.critic_update}
+        own = {name: update.optimizer.param_groups[0]["lr"] for name, update in updates.items()}
+        return {"world_model": world_model, "latent_critic": latent_critic, **own}
+
     def state_dict(self) -> dict[str, Any]:
         """Return everything that the next update depends on, except the global random generators."""
         return {

@@ -18,7 +18,13 @@ from torch import Tensor, nn
 
 from dreamer_racing import parallel
 from dreamer_racing.learners.config import LearnerConfig
-from dreamer_racing.learners.gradient_step import FiniteGuard, GraphedStep, gradient_norms, restore
+from dreamer_racing.learners.gradient_step import (
+    FiniteGuard,
+    GraphedStep,
+    gradient_norms,
+    restore,
+    step_with_gradients,
+)
 from dreamer_racing.learners.learner import Timer, ValueFunction, seeded, untimed
 from dreamer_racing.learners.saved import UnmatchedWeights, check_saved, check_weights, load_parameters, own_state
 from dreamer_racing.losses import Latents, LossConfig, WorldModelLoss, find_targets, policy_drift, replay_critic_loss
@@ -38,7 +44,7 @@ class WorldModelLearner(ABC):
         behavior: Names of the agent's networks that the optimiser trains besides the world model.
         own_networks: Networks that are not part of the agent, by name: the world-model loss with the networks of its
             targets, and those of the algorithm.
-        optimizer: Optimiser with two groups: the world model, and the ``behavior`` networks.
+        optimizer: Optimiser with a group for the world model and for each of the ``behavior`` networks.
         latents: Belief and state of the last batch's records, ``[B, T]``, to refresh the replay's latents; with
             ``cuda_graph`` the next update overwrites them.
         averaged: Copy of the agent with exponentially averaged weights, or None.
@@ -71,7 +77,7 @@ class WorldModelLearner(ABC):
         if few:
             use_few_kernels(nn.ModuleList([agent, *self.own_networks.values()]))
         self.averaged = None if self.config.average_rate is None else copy.deepcopy(agent).requires_grad_(False)
-        self.latents: TensorDictBase | None = None
+        self.latents: TensorDictBase  # of the last batch
         self.horizon = self.config.imagination_horizon
         self.updates = 0
         self._trained = self._parameters()
@@ -133,12 +139,10 @@ class WorldModelLearner(ABC):
 
         Raises:
             KeyError: If the batch lacks a key that a loss needs.
-            NonFiniteLossError: If a loss, gradient or reward is not finite. On a CPU the networks are unchanged then;
-                on a CUDA device it is raised two updates late, because waiting for the device would stall it.
+            NonFiniteLossError: If a loss, gradient or reward is not finite. On a CPU the networks are unchanged then,
+                unless it was PPO's update; on a CUDA device it is raised two checks late, because waiting for the
+                device would stall it.
         """
-
-    def collect(self, rollout: TensorDictBase) -> None:  # noqa: B027 - only on-policy learners need it
-        """Store a collector's rollout ``[N, T]``, flown by `policy`, perhaps with older weights; here do nothing."""
 
     @property
     def modules(self) -> nn.ModuleDict:
@@ -177,6 +181,12 @@ class WorldModelLearner(ABC):
     def evaluation_policy(self) -> DreamerPolicy:
         """Return the policy of `evaluation_agent`, which shares its parameters."""
         return DreamerPolicy(self.evaluation_agent.world_model, self.evaluation_agent.actor)
+
+    @property
+    def learning_rates(self) -> dict[str, float]:
+        """Current learning rates by what they train."""
+        rates = [group["lr"] for group in self.optimizer.param_groups]
+        return dict(zip(("world_model", *self.behavior), rates, strict=True))
 
     def value_function(self) -> ValueFunction:
         """Return the value function of the critic that the actor learns from."""
@@ -218,12 +228,14 @@ class WorldModelLearner(ABC):
     def replay_critic_losses(
         self, latents: Latents, batch: TensorDictBase, bootstrap: Tensor | None = None
     ) -> dict[str, Tensor]:
-        """Return ``loss_replay_critic`` of a batch ``[B, T]``: the agent's critic learns its λ-returns.
+        """Return ``loss_replay_critic`` of a batch ``[B, T]``, if turned on: the agent's critic learns its λ-returns.
 
         With ``replay_value_gradient`` the latents learn to tell what these depend on, too. The returns continue with
         the ``bootstrap`` values ``(B, T, 1)``; None for the critic's own.
         """
         numbers = self.loss_config
+        if not numbers.replay_value_scale:
+            return {}
         features = latents.features if numbers.replay_value_gradient else latents.features.detach()
         loss = replay_critic_loss(
             self.agent.critic, features, batch, self.discount, numbers.lambda_, numbers.slow_critic_scale, bootstrap
@@ -253,7 +265,7 @@ class WorldModelLearner(ABC):
                 metrics = parallel.average_gradients(networks, metrics) | gradient_norms(self._trained)
         self._guard.check(metrics, batch)
         with timed("optimise"):
-            self.optimizer.step()
+            step_with_gradients(self.optimizer)
             self.agent.critic.update_slow(self.config.slow_critic_rate)
             if not self.config.cuda_graph:
                 self.optimizer.zero_grad(set_to_none=True)
@@ -315,9 +327,9 @@ class WorldModelLearner(ABC):
         if rates is None and world_model_rate != 1.0:
             raise ValueError(f"adjust(world_model_rate={world_model_rate:g}) is a factor on rates: give rates=, too.")
         if rates is not None:
-            shares = (world_model_rate, 1.0)
-            for group, rate, share in zip(self.optimizer.param_groups, self._rates, shares, strict=True):
-                group["lr"] = rate * rates * share
+            for group, rate in zip(self.optimizer.param_groups, self._rates, strict=True):
+                group["lr"] = rate * rates
+            self.optimizer.param_groups[0]["lr"] *= world_model_rate
         fill_given((self.discount, discount), (self.entropy_scale, entropy_scale))
         for name, bound in (("min_std", min_std), ("max_std", max_std)):
             if bound is not None:
@@ -396,10 +408,9 @@ class WorldModelLearner(ABC):
         from torchrl.trainers.algorithms import DreamerV3Optimizer
 
         rate = self.config.learning_rate
-        behavior = [parameter for name in self.behavior for parameter in self._trained[name]]
-        groups: list[dict[str, Any]] = [
-            {"params": self._trained["world_model"], "lr": rate},
-            {"params": behavior, "lr": self.config.behavior_learning_rate or rate},
+        groups: list[dict[str, Any]] = [{"params": self._trained["world_model"], "lr": rate}]
+        groups += [
+            {"params": self._trained[name], "lr": self.config.behavior_learning_rate or rate} for name in self.behavior
         ]
         return DreamerV3Optimizer(groups, lr=rate, warmup_steps=self.config.warmup_updates)
 

@@ -52,7 +52,8 @@ class Trajectory:
         value: Critic's value, ``(H, N, 1)``.
         advantage: λ-return minus value, ``(H, N, 1)``: divided by ``scale`` for imagined steps, normalised to mean 0
             and standard deviation 1 for collected ones.
-        weight: Weight of each step, ``(H, N, 1)``: discounted probability of reaching it if imagined, 1 if collected.
+        weight: Weight of each step, ``(H, N, 1)``: 1 if collected; if imagined the product of the discounts before
+            it, each γ times the probability that the episode continues to the power of ``crash_weight``.
         scale: Range of the returns, at least 1, a scalar.
     """
 

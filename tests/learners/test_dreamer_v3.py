@@ -89,21 +89,55 @@ def test_the_actor_begins_after_so_many_updates(actor):
         assert any(moved) == begun
 
 
-@pytest.mark.parametrize("actor", ["reinforce", "dynamics"])
-def test_the_actor_begins_with_steps_no_larger_than_those_of_one_that_has_not_waited(actor):
+@pytest.mark.parametrize(
+    ("actor", "changed"),
+    [("reinforce", {"actor_begin": 30}), ("dynamics", {"actor_begin": 30}), ("dynamics", {"imagination_every": 3})],
+)
+def test_the_actor_begins_with_steps_no_larger_than_those_of_one_that_learns_in_every_update(actor, changed):
     first_steps = []
-    for begin in (0, 80):
-        learner = learner_of(actor=actor, actor_begin=begin, seed=0, **CONFIG)
-        learner.optimizer.param_groups[0]["lr"] = 0.0  # the model stays, so that gradients do
+    for waits in ({}, changed):
+        learner = learner_of(actor=actor, seed=0, **CONFIG | waits)
+        world_model, _, critic = learner.optimizer.param_groups
+        world_model["lr"] = critic["lr"] = 0.0  # they stay, so that gradients do
         batch = make_batch()
-        for _ in range(80):
+        every = waits.get("imagination_every", 1)
+        for _ in range(30 * every):
             learner.update(batch)
         before = [parameter.clone() for parameter in learner.agent.actor.parameters()]
-        for _ in range(3):
+        for _ in range(3 * every):
             learner.update(batch)
         after = learner.agent.actor.parameters()
         first_steps.append(sum((a - b).square().sum() for a, b in zip(after, before, strict=True)).sqrt())
     assert first_steps[1] < 1.1 * first_steps[0]
+
+
+def test_a_checkpoint_whose_optimiser_had_one_group_for_actor_and_critic_goes_on():
+    batch, learner = make_batch(), learner_of(seed=0, **CONFIG)
+    learner.update(batch)
+    saved = copy.deepcopy(learner.state_dict())
+    world_model, actor, critic = saved["optimizer"]["param_groups"]
+    joint = {**actor, "params": actor["params"] + critic["params"]}
+    saved["optimizer"]["param_groups"] = [world_model, joint]
+    resumed = learner_of(seed=1, **CONFIG)
+    resumed.load_state_dict(saved)
+    for each in (learner, resumed):
+        torch.manual_seed(5)
+        each.update(batch)
+    assert not differing(learner.agent.state_dict(), resumed.agent.state_dict())
+    assert [group["step"] for group in resumed.optimizer.param_groups] == [2, 2, 2]
+
+
+def test_what_is_turned_off_is_not_computed():
+    learner = learner_of(seed=0, replay_value_scale=0.0, **CONFIG)
+    assert "loss_replay_critic" not in learner.update(make_batch())
+
+
+def test_a_metric_of_an_own_objective_is_not_taken_for_a_loss():
+    learner = learner_of(seed=0, **CONFIG)
+    objective = learner.objective
+    learner.objective = lambda *values, **numbers: (objective(*values, **numbers)[0], {"loss_of_mine": torch.ones(())})
+    with pytest.raises(ValueError, match="the metric 'loss_of_mine' would be added to the losses: rename it"):
+        learner.update(make_batch())
 
 
 def made_with(seed, loss="reconstruction", **interface):
@@ -271,7 +305,7 @@ def test_rates_are_the_settings_of_the_learner_that_goes_on():
     learner.update(make_batch())
     other = learner_of(seed=1, **CONFIG | {"learning_rate": 1e-5, "behavior_learning_rate": 1e-6, "warmup_updates": 7})
     other.load_state_dict(copy.deepcopy(learner.state_dict()))
-    assert [group["lr"] for group in other.optimizer.param_groups] == [1e-5, 1e-6]
+    assert [group["lr"] for group in other.optimizer.param_groups] == [1e-5, 1e-6, 1e-6]
     assert {group["warmup_steps"] for group in other.optimizer.param_groups} == {7}
     assert other.updates == 1
 
@@ -280,8 +314,9 @@ def test_what_is_scheduled_reaches_optimiser_and_losses_and_stays():
     learner = learner_of(seed=0, **CONFIG | {"learning_rate": 1e-3, "behavior_learning_rate": 4e-4})
 
     def settings() -> list[float]:
-        rates = [group["lr"] for group in learner.optimizer.param_groups]
-        return [*rates, float(learner.discount), float(learner.entropy_scale)]
+        rates = learner.learning_rates
+        assert rates["actor"] == rates["critic"]
+        return [rates["world_model"], rates["actor"], float(learner.discount), float(learner.entropy_scale)]
 
     learner.adjust(rates=0.5, discount=0.9, entropy_scale=0.1)
     assert settings() == pytest.approx([5e-4, 2e-4, 0.9, 0.1])

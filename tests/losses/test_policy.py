@@ -263,7 +263,8 @@ def test_a_policy_that_is_held_moves_less_while_the_model_learns(few_kernels: bo
     moved = {}
     for scale in (0.0, 3.0):
         learner = make_learner(drift_scale=scale, learning_rate=3e-3, warmup_updates=0, few_kernels=few_kernels)
-        learner.optimizer.param_groups[1]["lr"] = 0.0  # actor and critic
+        for group in learner.optimizer.param_groups[1:]:  # actor and critic
+            group["lr"] = 0.0
         batch = stored_by(learner)
         actor = learner.agent.actor
         with torch.no_grad():

@@ -31,7 +31,7 @@ from typing import Any
 import mujoco
 import pytest
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
 from dreamer_racing.envs import DroneRacingEnv
 from dreamer_racing.training.checkpoint import load_state
@@ -105,6 +105,25 @@ def weights_in(state: Any, name: str = "") -> Iterator[Tensor]:
                 yield from weights_in(value, str(key))
 
 
+def rounding() -> str:
+    """Return a digest of plain layers' outputs and gradients: processors of one model may add in another order."""
+    threads, before = torch.get_num_threads(), torch.get_rng_state()
+    torch.set_num_threads(1)
+    torch.manual_seed(0)
+    parts = []
+    for channels, width in ((8, 64), (16, 200), (64, 511)):
+        layers = nn.Sequential(
+            nn.Conv2d(3, channels, 4, stride=2, padding=1), nn.SiLU(), nn.Conv2d(channels, channels, 3), nn.Flatten(),
+            nn.LazyLinear(width), nn.LayerNorm(width), nn.Tanh(), nn.Linear(width, 3 * width),
+        )  # fmt: skip
+        output = layers(torch.rand(32, 3, 32, 32)).softmax(-1).square().sum()
+        output.backward()
+        parts += [output.detach(), *(parameter.grad for parameter in layers.parameters())]
+    torch.set_num_threads(threads)
+    torch.set_rng_state(before)
+    return hashlib.sha256(b"".join(part.contiguous().numpy().tobytes() for part in parts)).hexdigest()[:16]
+
+
 @functools.cache
 def fingerprint() -> dict[str, str]:
     """Say what rounding depends on: versions, the processor, and how OpenGL draws a frame."""
@@ -120,6 +139,7 @@ def fingerprint() -> dict[str, str]:
         "mujoco": mujoco.__version__,
         "kernels": torch.backends.cpu.get_cpu_capability(),
         "processor": " ".join((platform.machine(), *cpu)),
+        "rounding": rounding(),
         "frame": hashlib.sha256(frame).hexdigest()[:16],
     }
 
