@@ -73,7 +73,7 @@ class ExportConfig:
     agent: str | None = None  # folder for a complete agent, instead of output, e.g. agents/kidney
     evaluation: str | None = None  # with agent=: evaluation.json to include; null: the run's latest of these weights
     commit: str | None = None  # with agent=: git commit of the training; null: the one that the run noted
-    latent: str = "mode"  # mode (argmax of the posterior) | sample (takes noise)
+    latent: str = "mode"  # mode: nothing is sampled | sample: takes noise
     # also write the step in two parts, so that the one without images can run before the image (docs/export.md)
     parts: bool = False
     steps: int = setting(200, COUNT)  # control steps of a recorded flight, on which the export must act as the original

@@ -108,10 +108,9 @@ class StreamReplay(TensorDictReplayBuffer):
     def _sample(self, batch_size: int) -> tuple[TensorDictBase, dict]:
         """Sample a batch including its slots; TorchRL's own method would copy those synchronously."""
         with self._replay_lock, self._write_lock:
-            slots, info = self._sampler.sample(self._storage, batch_size)
+            slots, _ = self._sampler.sample(self._storage, batch_size)
             records = self._storage.get(slots)
-        for name, value in {"index": slots, **info}.items():
-            records.set(name, send(value, self._storage.device))
+        records.set("index", send(slots, self._storage.device))
         return self._transformed(records), {}
 
     def refresh(self, slots: Tensor, belief: Tensor, state: Tensor) -> None:

@@ -313,9 +313,7 @@ class StreamSampler(RandomSampler):
         self._held_out = torch.arange(writer.num_streams) >= writer.num_streams - held_out  # (N,)
 
     def sample(self, storage: Storage, batch_size: int) -> tuple[Tensor, dict]:
-        """Return the slots of ``batch_size`` windows, int64 ``(B, T)`` on the CPU, and ``{"recent": bool (B, T)}``.
-
-        ``recent`` marks windows that were drawn from the newest records; a sample of the replay includes it.
+        """Return the slots of ``batch_size`` windows, int64 ``(B, T)`` on the CPU, the recent ones last.
 
         Raises:
             RuntimeError: If no stream holds T records yet.
@@ -330,8 +328,7 @@ class StreamSampler(RandomSampler):
         slots = [self._draw(batch_size - recent, self.batch_length, filled, self._rng)]
         if recent:
             slots.append(self._draw(recent, self.batch_length, filled.clamp(max=self.recent_length), self._rng))
-        is_recent = torch.arange(batch_size) >= batch_size - recent  # (B,)
-        return torch.cat(slots), {"recent": is_recent.unsqueeze(-1).expand(-1, self.batch_length)}
+        return torch.cat(slots), {}
 
     def held_out(self, num_windows: int, length: int, recent: int | None = None) -> Tensor | None:
         """Return the slots of windows in the held-out streams, or None; see `StreamReplay.held_out`."""

@@ -64,7 +64,8 @@ class DreamerPolicy(TensorDictModuleBase):
     Args:
         world_model: World model whose encoder and RSSM are used (shared, not copied).
         actor: The policy head.
-        deterministic: Use the mode of the latents and the mean of clipped actions, no samples; may be set at any time.
+        deterministic: Use the mode of latents that are ``sampled``, and the mean of clipped actions; may be set at any
+            time.
 
     | key | read / written | shape |
     |---|---|---|

@@ -34,7 +34,7 @@ class Posterior(NamedTuple):
 
     Attributes:
         belief: h, ``(B, T, D)``.
-        state: z, a straight-through sample as flattened one-hots, ``(B, T, S)``.
+        state: z, ``(B, T, S)``: straight-through samples as flattened one-hots, or probabilities if not ``sampled``.
         posterior_logits: Logits of q(z | h, o), ``(B, T, L, K)``.
         prior_logits: Logits of p(z | h), ``(B, T, L, K)``.
     """

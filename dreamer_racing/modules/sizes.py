@@ -64,7 +64,7 @@ class ModelSize:
 
     @property
     def state(self) -> int:
-        """Width of the stochastic state z: flattened one-hots."""
+        """Width of the state z: flattened one-hots or, if not ``sampled``, probabilities."""
         return self.latents * self.classes
 
     @property

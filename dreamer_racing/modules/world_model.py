@@ -75,9 +75,9 @@ class WorldModel(nn.Module):
 
     @torch.no_grad()
     def open_loop(
-        self, observation: Mapping[str, Tensor], previous_action: Tensor, is_init: Tensor, context: int
+        self, observation: Mapping[str, Tensor], previous_action: Tensor, is_init: Tensor, num_observed: int
     ) -> tuple[Tensor, Tensor]:
-        """Observe the first ``context`` records, then predict the others from their actions alone.
+        """Observe the first ``num_observed`` records, then predict the others from their actions alone.
 
         Resets beyond the observed records are ignored. Arguments as for ``observe``.
 
@@ -85,18 +85,18 @@ class WorldModel(nn.Module):
             Beliefs ``(B, T, D)`` and states ``(B, T, S)``.
 
         Raises:
-            ValueError: If ``context`` is not between 1 and T.
+            ValueError: If ``num_observed`` is not between 1 and T.
         """
         time = previous_action.shape[1]
-        if not 1 <= context <= time:
+        if not 1 <= num_observed <= time:
             raise ValueError(
-                f"open_loop: context must lie between 1 and the {time} records of the batch, got {context}"
+                f"open_loop: num_observed must lie between 1 and the {time} records of the batch, got {num_observed}"
             )
-        seen = slice(0, context)
+        seen = slice(0, num_observed)
         posterior = self.observe(
             {key: observation[key][:, seen] for key in self.encoder.keys}, previous_action[:, seen], is_init[:, seen]
         )
-        predicted = self.predict(posterior.belief[:, -1], posterior.state[:, -1], previous_action[:, context:])
+        predicted = self.predict(posterior.belief[:, -1], posterior.state[:, -1], previous_action[:, num_observed:])
         return torch.cat((posterior.belief, predicted[0]), 1), torch.cat((posterior.state, predicted[1]), 1)
 
     def predict(self, belief: Tensor, state: Tensor, actions: Tensor) -> tuple[Tensor, Tensor]:

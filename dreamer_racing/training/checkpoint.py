@@ -41,7 +41,7 @@ class CheckpointConfig:
     """Checkpoints during training."""
 
     every: int = setting(50_000, NOT_NEGATIVE)  # env_steps between checkpoints
-    # minutes of wall-clock time between checkpoints, for preemptible machines; 0: by env_steps alone
+    # minutes of wall-clock time between checkpoints, for preemptible machines; 0: only one soon after each start
     minutes: float = setting(0.0, NOT_NEGATIVE)
     keep: int = setting(2, COUNT)  # number of newest checkpoints kept
 

@@ -10,10 +10,10 @@ from typing import TYPE_CHECKING, Any, TypeAlias
 
 import numpy as np
 import torch
-from omegaconf import DictConfig, OmegaConf
+from omegaconf import OmegaConf
 from torchrl.collectors import Collector
 
-from composing.saved import OBSERVATION_SETTINGS, read_yaml
+from composing.saved import OBSERVATION_SETTINGS, saved_config
 from composing.schema import (
     EnvConfig,
     LatentPPORunConfig,
@@ -41,7 +41,7 @@ from dreamer_racing.learners.latent_ppo import LatentPPO
 from dreamer_racing.learners.learner import Learner, Policy
 from dreamer_racing.learners.update import WorldModelLearner
 from dreamer_racing.losses import find_targets
-from dreamer_racing.modules import Agent, Interface, ModelSize, get_size
+from dreamer_racing.modules import Interface, ModelSize, get_size
 from dreamer_racing.modules.interface import PRIVILEGED
 from dreamer_racing.modules.rssm import LatentFormat
 from dreamer_racing.training.checkpoint import load_state
@@ -129,18 +129,12 @@ def size_of(config: WorldModelRunConfig) -> ModelSize:
     return replace(get_size(config.model.size), sampled=config.model.sampled, state_std=config.model.state_std)
 
 
-def make_agent(config: WorldModelRunConfig, interface: Interface) -> Agent:
-    """Make the networks of a resolved configuration, with initial weights from torch's generator."""
-    decodes = any(target.decodes for target in find_targets(config.loss.world_model))
-    return Agent(size_of(config), interface, decodes, config.loss.min_std, config.loss.max_std).to(config.device)
-
-
 def load_initial_weights(learner: WorldModelLearner, config: WorldModelRunConfig, env: Environment) -> str:
     """Load the weights that ``init_from`` names into a new learner, if they fit; return a log line on them."""
     source = str(config.init_from)
     folder = existing_agent_path("init_from", source)
     if not is_agent(folder):
-        saved = read_yaml(RunDirectory.of(latest_checkpoint(folder)).config, DictConfig)
+        saved = saved_config(RunDirectory.of(latest_checkpoint(folder)).path)
         for name in OBSERVATION_SETTINGS:
             there, here = OmegaConf.select(saved, name), OmegaConf.select(OmegaConf.structured(config), name)
             if there != here:

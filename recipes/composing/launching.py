@@ -29,7 +29,6 @@ from composing.saved import (
 from composing.schema import RunConfig, WorldModelRunConfig, is_race
 from dreamer_racing import parallel
 from dreamer_racing.commands import from_here
-from dreamer_racing.experience.replay import Storage
 from dreamer_racing.experience.rollouts import WorkerError
 from dreamer_racing.export.agents import agent_path
 from dreamer_racing.export.shipped_agent import is_agent
@@ -133,7 +132,13 @@ def check_read(config: DictConfig, overrides: Sequence[str]) -> None:
         ("loss.crash_weight", config.loss.get("continuation", True), "loss.continuation=true"),
         ("loss.drift_scale", drift, "stored latents (replay.context=true) without sampling (model.sampled=false)"),
         ("replay.recent_records", config.replay.recent_share > 0, "replay.recent_share above 0"),
-        ("replay.device", config.replay.storage is Storage.tensor, "replay.storage=tensor"),
+        ("schedule.crash_weight.to", config.loss.get("continuation", True), "loss.continuation=true"),
+        *(
+            (f"schedule.{ramp}.{part}", numbers.to is not None, f"schedule.{ramp}.to")
+            for ramp, numbers in config.schedule.items()
+            if isinstance(numbers, DictConfig)
+            for part in ("begin", "end", "by")
+        ),
         ("schedule.wait_every", config.schedule.get("wait_for_model", 0) is not None, "schedule.wait_for_model"),
     ):
         if name in given and not read and (value := OmegaConf.select(config, name)) is not None:

@@ -109,6 +109,7 @@ class Restored:
 def restore(config: FlightConfig) -> Restored:
     """Restore the policy of a checkpoint or agent, for the race that the configuration names."""
     started, machine = time.monotonic(), provenance()
+    torch.set_float32_matmul_precision("high")  # as in training
     device = choose_device(config.device)
     checkpoint = find_trained(config.checkpoint)
     trained = trained_config(config_folder(checkpoint))
@@ -144,19 +145,20 @@ def restore_learner(
     config: RunConfig, checkpoint: Path, device: torch.device, weights: str = "auto"
 ) -> tuple[Learner, dict[str, int]]:
     """Restore the learner of a run's checkpoint with the requested weights, and the run's counters."""
-    chosen = choose_weights(weights, kept_weights(load_state(checkpoint, "learner")[0]), checkpoint)
+    state, _ = load_state(checkpoint, "learner")
+    chosen = choose_weights(weights, kept_weights(state), checkpoint)
     if isinstance(config, WorldModelRunConfig):
         config.model.cuda_graph = False
         config.model.average_rate = (config.model.average_rate or 1.0) if chosen == AVERAGED else None
     with closing(_probe(config)) as env:
         learner = make_learner(config, Interface.of(env), device)
+    learner.load_state_dict(state)
     counters: dict[str, int] = {}
-    parts = {"learner": learner, "counters": counters}
     if not isinstance(config, WorldModelRunConfig):
-        load_components(checkpoint, parts)
+        load_components(checkpoint, {"counters": counters})
         return learner, counters
     schedule = Schedule(config.schedule, config.scheduled, config.total_env_steps)  # its gates come from the checkpoint
-    load_components(checkpoint, {**parts, "schedule": schedule})
+    load_components(checkpoint, {"counters": counters, "schedule": schedule})
     # Saved with the networks; the schedule of a run that was made longer would give other values.
     left_out = ("min_std", "max_std", "start_on_line")
     numbers = {name: value for name, value in schedule.at(counters["env_steps"]).items() if name not in left_out}

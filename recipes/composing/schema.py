@@ -15,7 +15,7 @@ from dreamer_racing.envs.race.curriculum import BodyRateSchedule
 from dreamer_racing.envs.race.starts import StartSampler
 from dreamer_racing.envs.tracks import Track, read_track, with_decoys
 from dreamer_racing.experience.ray_cluster import WorkersConfig
-from dreamer_racing.experience.replay import ReplayConfig, SequenceReplayConfig
+from dreamer_racing.experience.replay import ReplayConfig, SequenceReplayConfig, Storage
 from dreamer_racing.figures.loggers import LoggerConfig
 from dreamer_racing.learners import PPOConfig, SACConfig
 from dreamer_racing.learners.config import LearnerConfig
@@ -136,8 +136,13 @@ class ReplayRunConfig(RunConfig):
         raise NotImplementedError
 
     def check(self) -> None:
-        """Check as `RunConfig.check`, and refuse settings with which there would be no update."""
+        """Check as `RunConfig.check`, and the replay's device; refuse settings with which there would be no update."""
         super().check()
+        if (device := self.replay.device) != "auto":
+            if self.replay.storage is Storage.memmap:
+                raise ValueError(f"replay.device={device} is for replay.storage=tensor: leave it out.")
+            if device.partition(":")[0] not in ("cpu", "cuda"):
+                raise ValueError(f"replay.device={device}: must be auto, cpu or cuda.")
         if self.total_env_steps <= self.prefill:
             raise ValueError(
                 f"total_env_steps={self.total_env_steps} must be above prefill={self.prefill}, the steps before the "

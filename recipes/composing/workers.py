@@ -10,16 +10,15 @@ import torch
 from omegaconf import DictConfig, OmegaConf
 from torchrl.envs import TensorDictPrimer, TransformedEnv
 
-from composing.building import Environment, make_agent, make_collector, make_env, worlds_device
+from composing.building import Environment, make_collector, make_env, worlds_device
 from composing.schema import CollectorKind, LatentPPORunConfig, WorldModelRunConfig, is_race, worker_settings
 from dreamer_racing import parallel
 from dreamer_racing.envs.policy_memory import with_memory
 from dreamer_racing.experience import ray_cluster
 from dreamer_racing.experience.ray_rollouts import RayRollouts
 from dreamer_racing.experience.rollouts import Rollouts
-from dreamer_racing.learners.learner import seeded
 from dreamer_racing.learners.update import WorldModelLearner
-from dreamer_racing.modules import DreamerPolicy, Interface
+from dreamer_racing.modules import DreamerPolicy
 
 DIVIDED = ("env.num_envs", "model.batch_size", "model.imagination_starts")
 DIVIDED_PPO = ("loss.ppo.steps", "loss.ppo.minibatch")
@@ -99,7 +98,6 @@ def make_workers(config: WorldModelRunConfig, env: Environment, policy: DreamerP
     """Start workers on a Ray cluster, each with its share of the worlds."""
     asked, workers, own = config.workers, cast(int, config.num_workers), copy.deepcopy(config)
     own.env.num_envs = config.env.num_envs // workers
-    own.device = "cpu"  # where its policy is made; the collector moves it to the worker's device
     own.env.device = worlds_device(torch.device(asked.device), config.env)
     print(
         f"workers: {workers} on Ray (workers.address={asked.address}), each with {own.env.num_envs} worlds on "
@@ -107,9 +105,7 @@ def make_workers(config: WorldModelRunConfig, env: Environment, policy: DreamerP
         "env_steps old; starting them takes half a minute",
         flush=True,
     )
-    with seeded(config.seed):
-        agent = make_agent(own, Interface.of(env))  # its weights come with the first request
-    flying = DreamerPolicy(agent.world_model, agent.actor)
+    flying = copy.deepcopy(policy).cpu()  # the collector moves it to the worker's device
     joined = ray_cluster.join(asked.address)
     worlds, frames = own.env.device, own.env.num_envs * config.rollout_steps
     make_worlds = partial(make_worker_env, own, flying.make_primer())

@@ -184,7 +184,7 @@ def test_collector_rollouts_in_every_storage(storage, image_shape, tmp_path):
     sample = replay.sample()
     assert sample.batch_size == (4, 5)
     assert sample["pixels"].shape == (4, 5, *image_shape)
-    assert set(sample.keys()) == {*KEYS, "index", "recent"}
+    assert set(sample.keys()) == {*KEYS, "index"}
 
 
 def test_windows_are_consecutive_after_the_ring_wrapped():

@@ -33,7 +33,7 @@ def test_open_loop_never_sees_what_lies_beyond_its_context():
     latents = []
     for version in (seen["pixels"], changed):
         torch.manual_seed(1)
-        latents.append(world_model.open_loop({"pixels": version}, action, is_init, context=2))
+        latents.append(world_model.open_loop({"pixels": version}, action, is_init, num_observed=2))
     assert all(map(torch.equal, *latents))
     images = world_model.images(*latents[0])
     assert images.shape == changed.shape
@@ -43,9 +43,9 @@ def test_open_loop_never_sees_what_lies_beyond_its_context():
 def test_the_context_is_a_part_of_the_window_or_all_of_it():
     world_model = WorldModel("debug", decode=False)
     for context in (0, 6):
-        with pytest.raises(ValueError, match="context"):
-            world_model.open_loop(*make_records(), context=context)
-    belief, state = world_model.open_loop(*make_records(), context=5)
+        with pytest.raises(ValueError, match="num_observed must lie"):
+            world_model.open_loop(*make_records(), num_observed=context)
+    belief, state = world_model.open_loop(*make_records(), num_observed=5)
     assert belief.shape[:2] == state.shape[:2] == (2, 5)
     with pytest.raises(ValueError, match="no image decoder"):
         world_model.images(belief, state)

@@ -60,7 +60,12 @@ REFUSED = [
     (["env.control_rate=60"], ["env.control_rate=60", "whole number of physics steps of 2 ms"]),
     (["env.start_on_line=1", "env.start_beyond_gate=0.5"], ["env.start_beyond_gate=0.5", "env.start_on_line=1 leaves"]),
     (["env.start_on_line=0.5", "schedule.start_on_line.to=2"], ["schedule.start_on_line.to=2.0: must be at least 0"]),
-    (["schedule.discount.begin=0.6", "schedule.discount.end=0.5"], ["schedule.discount: begin=0.6 and end=0.5"]),
+    (
+        ["schedule.discount.to=0.99", "schedule.discount.begin=0.6", "schedule.discount.end=0.5"],
+        ["schedule.discount: begin=0.6 and end=0.5"],
+    ),
+    (["replay.storage=memmap", "replay.device=cpu"], ["replay.device=cpu is for replay.storage=tensor"]),
+    (["replay.device=gpu"], ["replay.device=gpu: must be auto, cpu or cuda"]),
     (["schedule.learning_rates.to=0"], ["schedule.learning_rates.to=0.0: must be above 0"]),
     (["schedule.start_on_line.to=0.3"], ["schedule.start_on_line starts from env.start_on_line=0"]),
     (["loss.actor=asymmetric_ppo"], ["'asymmetric_ppo' was removed: use recipes/latent_ppo.py loss.critic=state."]),
@@ -152,8 +157,12 @@ def test_what_would_be_ignored_is_refused(overrides: list[str], words: str) -> N
         (["loss.drift_scale=1", "replay.context=true"], "drift_scale=1.* is for stored latents .*model.sampled=false"),
         (["loss.drift_scale=1", "model.sampled=false"], "drift_scale=1.* is for stored latents .replay.context=true"),
         (["replay.recent_records=9"], "replay.recent_records=9 is for replay.recent_share above 0"),
-        (["replay.storage=memmap", "replay.device=cpu"], "replay.device=cpu is for replay.storage=tensor"),
         (["loss.continuation=false", "loss.crash_weight=4"], "crash_weight=4.* is for loss.continuation=true, which"),
+        (
+            ["loss.continuation=false", "schedule.crash_weight.to=4"],
+            "crash_weight.to=4.* is for loss.continuation",
+        ),
+        (["schedule.discount.begin=0.5"], "discount.begin=0.5 is for schedule.discount.to, which is not chosen"),
         (["schedule.wait_every=9"], "wait_every=9 is for schedule.wait_for_model, which is not chosen"),
     ],
 )
@@ -188,6 +197,7 @@ def test_a_setting_of_another_algorithm_is_refused_with_the_recipe_that_takes_it
     "overrides",
     [
         ["tuned=race", "schedule.kl_target.to=null"],
+        ["schedule.discount.to=0.99", "schedule.discount.by=passes"],
         ["loss.critic=latent", "loss.ppo.steps=200"],
         ["loss=informed", "loss.privileged_scale=3", "replay.recent_share=0.1", "replay.recent_records=9"],
         ["loss=informed", "loss.image_scale=3", "loss.image_share=0.5"],
