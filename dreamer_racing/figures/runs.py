@@ -123,10 +123,10 @@ def _key_of_table(path: Path) -> CurveKey:
         (name for name in sorted(BUILTIN_TRACKS, key=len, reverse=True) if re.search(rf"(?:^|_){name}(?:_|$)", words)),
         "unknown",
     )
-    rest = re.sub(rf"(?:^|_){track}(?=_|$)", "", words).strip("_")
     with path.open(encoding="utf-8", errors="replace") as file:
         columns = file.readline().strip().split(",")
     algorithm = next((name for column, name in LOGGED_BY if column in columns), "")
+    rest = re.sub(rf"(?:^|_)(?:{track}|{algorithm or track})(?=_|$)", "", words).strip("_")
     folder = path.absolute().parent.name
     return CurveKey(track, algorithm, " ".join(filter(None, ("" if folder == algorithm else folder, rest))))
 
