@@ -121,7 +121,8 @@ def train_a_little(config: Losses, updates: int = 3) -> dict[str, Tensor]:
     """Updates, one of the actor among them; the weights and the metrics after them."""
     torch.randperm, ActionDistribution.sample = in_order, lambda policy: policy.mean  # of a process of its own
     learner = make_learner(config)
-    learner.collect(share(joint_rollout(learner)))
+    if isinstance(learner, LatentPPO):
+        learner.collect(share(joint_rollout(learner)))
     metrics: dict[str, Tensor] = {}
     for seed in range(updates):
         metrics |= learner.update(share(joint_batch(seed)))
