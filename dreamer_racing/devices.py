@@ -8,11 +8,11 @@ import torch
 from dreamer_racing.settings import suggestion
 
 
-def choose_device(device: str) -> torch.device:
+def choose_device(device: str, setting: str = "device") -> torch.device:
     """Return the device of a name; `auto` is CUDA if available, else the CPU.
 
     Raises:
-        ValueError: This machine has no such device.
+        ValueError: This machine has no such device; the message names the setting that asks for it.
     """
     if device == "auto":
         return torch.device("cuda" if torch.cuda.is_available() else "cpu")
@@ -23,11 +23,11 @@ def choose_device(device: str) -> torch.device:
         if "device type at start of device string" in str(error):  # torch lists twenty more types
             word = device.partition(":")[0]
             meant = " (did you mean cuda?)" if word == "gpu" else suggestion(word, ("auto", "cpu", "cuda"))
-            raise ValueError(f"device={device}: there are auto, cpu, cuda and cuda:1 ...{meant}.") from error
+            raise ValueError(f"{setting}={device}: there are auto, cpu, cuda and cuda:1 ...{meant}.") from error
         available = ["cpu", *(f"cuda:{index}" for index in range(torch.cuda.device_count()))]
         raise ValueError(
-            f"device={device}: {str(error).splitlines()[0].rstrip('.')}. This machine has: {', '.join(available)}; "
-            "device=auto chooses the best."
+            f"{setting}={device}: {str(error).splitlines()[0].rstrip('.')}. This machine has: {', '.join(available)}; "
+            f"{setting}=auto chooses the best."
         ) from error
     return chosen
 

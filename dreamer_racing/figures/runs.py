@@ -126,7 +126,8 @@ def _key_of_table(path: Path) -> CurveKey:
     with path.open(encoding="utf-8", errors="replace") as file:
         columns = file.readline().strip().split(",")
     algorithm = next((name for column, name in LOGGED_BY if column in columns), "")
-    rest = re.sub(rf"(?:^|_)(?:{track}|{algorithm or track})(?=_|$)", "", words).strip("_")
+    named = "|".join(filter(None, (track, algorithm)))
+    rest = re.sub(rf"(?:^|_)(?:{named})(?=_|$)", "", words).strip("_")
     folder = path.absolute().parent.name
     return CurveKey(track, algorithm, " ".join(filter(None, ("" if folder == algorithm else folder, rest))))
 

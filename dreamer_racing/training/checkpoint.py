@@ -13,7 +13,6 @@ import shutil
 from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import torch
@@ -291,6 +290,20 @@ def newest_sound(path: str | Path, parts: Collection[str] | None = None) -> Path
     raise RunCheckpointError(f"{'. '.join(damaged.values())}. It was not read; {advice}.")
 
 
+class SavedState:
+    """Part of a checkpoint that is only read: ``state`` is what was saved, once it is loaded."""
+
+    state: dict[str, Any]
+
+    def state_dict(self) -> dict[str, Any]:
+        """Return nothing: it is never saved."""
+        return {}
+
+    def load_state_dict(self, state: Mapping[str, Any]) -> None:
+        """Keep what was saved."""
+        self.state = dict(state)
+
+
 def load_state(path: str | Path, part: str) -> tuple[dict[str, Any], dict[str, Any]]:
     """Return the saved state of one part of a checkpoint, and the checkpoint's metadata with ``env_steps``.
 
@@ -298,9 +311,9 @@ def load_state(path: str | Path, part: str) -> tuple[dict[str, Any], dict[str, A
         FileNotFoundError: if there is no complete checkpoint.
         RunCheckpointError: if it has no such part, or all are damaged.
     """
-    loaded: list[Mapping[str, Any]] = []
-    metadata = load_components(path, {part: SimpleNamespace(state_dict=dict, load_state_dict=loaded.append)})
-    return dict(loaded[0]), metadata
+    saved = SavedState()
+    metadata = load_components(path, {part: saved})
+    return saved.state, metadata
 
 
 def _bind(components: Mapping[str, Any]) -> Checkpoint:

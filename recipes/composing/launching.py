@@ -121,6 +121,7 @@ def check_read(config: DictConfig, overrides: Sequence[str]) -> None:
 
     images = have(Image) and config.env.from_pixels
     drift = config.loss.drift_scale == 0 or (config.replay.context and not config.model.sampled)
+    flat = [key for key, ramp in config.schedule.items() if isinstance(ramp, DictConfig) and ramp.to is None]
     given = {override_key(override) for override in overrides}
     for name, read, reader in (
         ("loss.image_scale", images, "loss=reconstruction or informed, from images"),
@@ -133,12 +134,7 @@ def check_read(config: DictConfig, overrides: Sequence[str]) -> None:
         ("loss.drift_scale", drift, "stored latents (replay.context=true) without sampling (model.sampled=false)"),
         ("replay.recent_records", config.replay.recent_share > 0, "replay.recent_share above 0"),
         ("schedule.crash_weight.to", config.loss.get("continuation", True), "loss.continuation=true"),
-        *(
-            (f"schedule.{ramp}.{part}", numbers.to is not None, f"schedule.{ramp}.to")
-            for ramp, numbers in config.schedule.items()
-            if isinstance(numbers, DictConfig)
-            for part in ("begin", "end", "by")
-        ),
+        *((f"schedule.{key}.{part}", False, f"schedule.{key}.to") for key in flat for part in ("begin", "end", "by")),
         ("schedule.wait_every", config.schedule.get("wait_for_model", 0) is not None, "schedule.wait_for_model"),
     ):
         if name in given and not read and (value := OmegaConf.select(config, name)) is not None:

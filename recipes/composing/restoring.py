@@ -34,7 +34,7 @@ from dreamer_racing.learners.update import WorldModelLearner
 from dreamer_racing.machine import command_line, provenance
 from dreamer_racing.modules import Interface
 from dreamer_racing.settings import COUNT, SEED, setting
-from dreamer_racing.training.checkpoint import load_components, load_state
+from dreamer_racing.training.checkpoint import SavedState, load_components
 from dreamer_racing.training.schedule import Schedule
 
 
@@ -145,24 +145,23 @@ def restore_learner(
     config: RunConfig, checkpoint: Path, device: torch.device, weights: str = "auto"
 ) -> tuple[Learner, dict[str, int]]:
     """Restore the learner of a run's checkpoint with the requested weights, and the run's counters."""
-    state, _ = load_state(checkpoint, "learner")
-    chosen = choose_weights(weights, kept_weights(state), checkpoint)
+    saved, counters = SavedState(), dict[str, int]()
+    parts: dict[str, Any] = {"learner": saved, "counters": counters}  # read together, so of one checkpoint
+    if isinstance(config, WorldModelRunConfig):  # its gates come from the checkpoint
+        parts["schedule"] = Schedule(config.schedule, config.scheduled, config.total_env_steps)
+    load_components(checkpoint, parts)
+    chosen = choose_weights(weights, kept_weights(saved.state), checkpoint)
     if isinstance(config, WorldModelRunConfig):
         config.model.cuda_graph = False
         config.model.average_rate = (config.model.average_rate or 1.0) if chosen == AVERAGED else None
     with closing(_probe(config)) as env:
         learner = make_learner(config, Interface.of(env), device)
-    learner.load_state_dict(state)
-    counters: dict[str, int] = {}
-    if not isinstance(config, WorldModelRunConfig):
-        load_components(checkpoint, {"counters": counters})
-        return learner, counters
-    schedule = Schedule(config.schedule, config.scheduled, config.total_env_steps)  # its gates come from the checkpoint
-    load_components(checkpoint, {"counters": counters, "schedule": schedule})
-    # Saved with the networks; the schedule of a run that was made longer would give other values.
-    left_out = ("min_std", "max_std", "start_on_line")
-    numbers = {name: value for name, value in schedule.at(counters["env_steps"]).items() if name not in left_out}
-    cast(WorldModelLearner, learner).adjust(**numbers)
+    learner.load_state_dict(saved.state)
+    if (schedule := parts.get("schedule")) is not None:
+        # Saved with the networks; the schedule of a run that was made longer would give other values.
+        left_out = ("min_std", "max_std", "start_on_line")
+        numbers = {name: value for name, value in schedule.at(counters["env_steps"]).items() if name not in left_out}
+        cast(WorldModelLearner, learner).adjust(**numbers)
     return learner, counters
 
 

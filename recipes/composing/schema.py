@@ -10,6 +10,7 @@ from hydra.core.config_store import ConfigStore
 from omegaconf import MISSING, DictConfig
 
 from dreamer_racing import parallel
+from dreamer_racing.devices import choose_device
 from dreamer_racing.envs.config import EnvConfig
 from dreamer_racing.envs.race.curriculum import BodyRateSchedule
 from dreamer_racing.envs.race.starts import StartSampler
@@ -138,11 +139,9 @@ class ReplayRunConfig(RunConfig):
     def check(self) -> None:
         """Check as `RunConfig.check`, and the replay's device; refuse settings with which there would be no update."""
         super().check()
-        if (device := self.replay.device) != "auto":
-            if self.replay.storage is Storage.memmap:
-                raise ValueError(f"replay.device={device} is for replay.storage=tensor: leave it out.")
-            if device.partition(":")[0] not in ("cpu", "cuda"):
-                raise ValueError(f"replay.device={device}: must be auto, cpu or cuda.")
+        if self.replay.device != "auto" and self.replay.storage is Storage.memmap:
+            raise ValueError(f"replay.device={self.replay.device} is for replay.storage=tensor: leave it out.")
+        choose_device(self.replay.device, "replay.device")
         if self.total_env_steps <= self.prefill:
             raise ValueError(
                 f"total_env_steps={self.total_env_steps} must be above prefill={self.prefill}, the steps before the "

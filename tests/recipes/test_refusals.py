@@ -65,7 +65,7 @@ REFUSED = [
         ["schedule.discount: begin=0.6 and end=0.5"],
     ),
     (["replay.storage=memmap", "replay.device=cpu"], ["replay.device=cpu is for replay.storage=tensor"]),
-    (["replay.device=gpu"], ["replay.device=gpu: must be auto, cpu or cuda"]),
+    (["replay.device=gpu"], ["replay.device=gpu: there are auto, cpu, cuda and cuda:1 ... (did you mean cuda?)"]),
     (["schedule.learning_rates.to=0"], ["schedule.learning_rates.to=0.0: must be above 0"]),
     (["schedule.start_on_line.to=0.3"], ["schedule.start_on_line starts from env.start_on_line=0"]),
     (["loss.actor=asymmetric_ppo"], ["'asymmetric_ppo' was removed: use recipes/latent_ppo.py loss.critic=state."]),
