@@ -9,6 +9,7 @@ from pathlib import Path
 
 import hydra
 import pytest
+import torch
 from omegaconf import DictConfig, OmegaConf
 
 from dreamer_racing.evaluation.image_corruptions import CORRUPTIONS
@@ -88,6 +89,17 @@ def test_a_finished_run_whose_newest_checkpoint_is_damaged_goes_on(run_dir: Path
     done = completed("dreamer_v3", "resume=run", f"total_env_steps={env_steps}", cwd=tmp_path, before=UNDRAWN)
     assert "already complete" not in done.stdout and done.stdout.count("is damaged") == 1
     assert newest_sound(copied) == newest and RunDirectory(copied).finished_env_steps() == env_steps
+
+
+def test_what_flies_and_its_counters_are_of_one_checkpoint(run_dir: Path, tmp_path: Path) -> None:
+    """If the newest learner is damaged, the counters beside it do not count."""
+    copied = shutil.copytree(run_dir, tmp_path / "run")
+    newest = latest_checkpoint(copied)
+    next(newest.rglob("*-learner/*.pt")).write_bytes(b"")
+    restoring = recipe_module("composing.restoring")
+    config = recipe_module("composing.saved").trained_config(copied)
+    _, counters = restoring.restore_learner(config, copied, torch.device("cpu"))
+    assert counters["env_steps"] == env_steps_of(newest_sound(copied)) < env_steps_of(newest)
 
 
 def test_a_resumed_run_cannot_change_its_track(run_dir: Path) -> None:
