@@ -9,7 +9,7 @@ r"""Fly a vehicle, real or simulated in a process of its own: poses in, images d
     python recipes/hil.py replay=runs/hil_kidney_20260101-120000          # the same again, from its file
     python recipes/hil.py report=runs/hil_kidney_20260101-120000
 
-Read docs/hil_safety.md before anything with propellers. Only actor=pilot and report= need torch.
+Read docs/hil_safety.md before anything with propellers.
 """
 
 import json
@@ -20,7 +20,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple, cast
 
-from composing.entry import new_run_dir, plain_errors, recipe
+from composing.entry import new_run_dir, plain_disk_errors, plain_errors, recipe
 from composing.options import command
 from omegaconf import OmegaConf
 from omegaconf.errors import OmegaConfBaseException
@@ -73,7 +73,7 @@ def make_flyer(config: HilConfig, track: Track | None = None) -> tuple[Flyer, di
     """Make the flyer, a pilot for another track than the configuration's if given; return it with its contract."""
     assert config.actor is not None, "checked"
     if config.actor == PILOT:
-        from dreamer_racing.plant.pilot import PilotFlyer  # needs torch, unlike actors
+        from dreamer_racing.plant.pilot import PilotFlyer
 
         if config.track is None:
             raise ValueError("track= is missing: actor=pilot has none of its own.")
@@ -95,10 +95,13 @@ def fly(config: HilConfig) -> int:
         with plain_hil_errors():
             flight = prepare(config, opened)
         ended = flight.loop.run(config.duration, config.patience)  # errors in flight are defects: with traceback
-        with plain_hil_errors():
+        summary = conclude(config, flight, ended)
+        print(*summary_lines(summary), sep="\n")
+        with plain_disk_errors():
             opened.close()
-            summary = conclude(config, flight, ended)
-    print(*summary_lines(summary), sep="\n")
+            if config.record:
+                text = json.dumps(summary, indent=2) + "\n"
+                (flight.folder / STATISTICS).write_text(text, encoding="utf-8")
     wanted = 0 if config.laps is None else config.laps * flight.track.num_gates
     flown = flight.loop.flew and len(summary["passes"]) >= wanted
     return 0 if flown and not ended.startswith("cut") else 1
@@ -151,7 +154,7 @@ def prepare(config: HilConfig, opened: ExitStack) -> Prepared:
 
 
 def conclude(config: HilConfig, flight: Prepared, ended: str) -> dict[str, Any]:
-    """Return the summary of a flight, and write it beside its recording."""
+    """Return the summary of a flight."""
     chain = flight.chain
     summary = {
         "ended": ended,
@@ -165,8 +168,6 @@ def conclude(config: HilConfig, flight: Prepared, ended: str) -> dict[str, Any]:
     if (thrust := flight.link.thrust) is not None:
         battery = {"voltage_set": config.voltage, "voltage": thrust.voltage, "rejected": flight.link.rejected}
         summary["battery"] = battery | ({"readings": 0} if chain.battery is None else chain.battery.summary())
-    if config.record:
-        (flight.folder / STATISTICS).write_text(json.dumps(summary, indent=2) + "\n", encoding="utf-8")
     return summary
 
 

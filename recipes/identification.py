@@ -12,10 +12,14 @@ import logging
 import math
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 from composing.entry import plain_errors, recipe
 
 from dreamer_racing.envs.drone.parameters import SUFFIXES
+
+if TYPE_CHECKING:
+    from dreamer_racing.identification.fitting import Fit
 
 
 @dataclass
@@ -42,22 +46,29 @@ def main(config: IdentificationConfig) -> None:
         from dreamer_racing.identification.fitting import fit
         from dreamer_racing.identification.recorded import read_recorded
 
-        nominal, recorded = load_preset(config.preset), read_recorded(config.flight)
+        recorded = read_recorded(config.flight)
         recorded.check(f"flight={config.flight}")
+        nominal = recorded.drone(load_preset(config.preset))
+        if recorded.assumed is not None:
+            print("assumed, as in the flight: {:g} kg, {:.4g} N at full command".format(*recorded.assumed))
         logging.getLogger("dreamer_racing.identification").setLevel(logging.INFO)
         found = fit(recorded, nominal)
-        about = {
-            "flight": Path(config.flight).name,
-            "begun_with": Path(config.preset).name,
-            "error_of_rates": {axis: round(error, 4) for axis, error in found.errors.items()},
-            "not_told": list(found.unknown),
-        }
         if not all(math.isfinite(error) for error in found.errors.values()):
             raise ValueError("The fit diverged: start from a preset= closer to the drone.")
-        save_drone(Path(config.output), found.parameters, about)
+        save_drone(Path(config.output), found.parameters, sources(config, found))
         for line in found.lines(config.preset):
             print(line)
         print(f"written to {config.output}: env=betaflight env.preset={config.output}")
+
+
+def sources(config: IdentificationConfig, found: "Fit") -> dict[str, Any]:
+    """Return where the numbers of a drone's file come from."""
+    return {
+        "flight": Path(config.flight or "").name,
+        "begun_with": Path(config.preset).name,
+        "error_of_rates": {axis: round(error, 4) for axis, error in found.errors.items()},
+        "not_told": list(found.unknown),
+    }
 
 
 if __name__ == "__main__":

@@ -138,7 +138,7 @@ def _describe_imu(errors: ImuErrors) -> dict[str, Any]:
 def _describe_action(parameters: QuadrotorParameters) -> dict[str, Any]:
     thrust, widths = parameters.collective_thrust_scale, parameters.randomisation
     half_widths = {} if widths is None else asdict(widths)
-    delay_max = half_widths.pop("delay_max", None)
+    delays = [half_widths.pop(name, None) for name in ("delay_min", "delay_max")]
     return {
         "formula": "physical = offset + scale * action, action clipped to [-1, 1]",
         "channels": [
@@ -150,7 +150,7 @@ def _describe_action(parameters: QuadrotorParameters) -> dict[str, Any]:
         ],
         "hover": [parameters.hover_action, 0.0, 0.0, 0.0],
         "trained_mass_kg": parameters.mass,
-        "trained_command_delay_s": parameters.command_delay if widths is None else [0.0, delay_max],
+        "trained_command_delay_s": parameters.command_delay if widths is None else delays,
         **({} if widths is None else {"trained_half_widths": half_widths}),
     }
 

@@ -44,7 +44,8 @@ _LAYOUT = {
     "weights_sha256": str,
     "action": {"channels": [{"name": str, "unit": str, "offset": float, "scale": float}]},
     "control": {"rate_hz": float},
-    "source": {},
+    "source": {"track?": str},
+    "rate_loop?": {"kind": str, "p?": [float], "d?": [float], "motor_time_constant_s?": float},
     "camera?": {
         "width_px": int,
         "height_px": int,
@@ -332,6 +333,11 @@ def _inconsistency(contract: dict[str, Any]) -> str:
     actions = contract["inputs"][names.index("previous_action")]["shape"][-1]
     if (channels := len(contract["action"]["channels"])) != actions:
         return f"action.channels has {channels} entries, but the actor has {actions} actions"
+    loop = contract.get("rate_loop") or {"kind": None}
+    if loop["kind"] == "betaflight" and (
+        lacking := [name for name in ("p", "d", "motor_time_constant_s") if loop.get(name) is None]
+    ):
+        return f"rate_loop lacks {', '.join(lacking)}"
     rate = contract["control"]["rate_hz"]
     return "" if rate > 0 else f"control.rate_hz is {rate}, not above 0"
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ipaddress
 import logging
+from collections.abc import Mapping
 from dataclasses import dataclass, field, make_dataclass, replace
 from pathlib import Path
 from typing import Any, get_type_hints
@@ -12,9 +13,16 @@ from dreamer_racing.envs.drone.parameters import QuadrotorParameters
 from dreamer_racing.envs.tracks import Track
 from dreamer_racing.hil.battery import BatteryConfig
 from dreamer_racing.hil.betaflight import LINKS as BETAFLIGHT
-from dreamer_racing.hil.betaflight import rate_map, require_dump
+from dreamer_racing.hil.betaflight import gains_unlike_training, rate_map, require_dump
 from dreamer_racing.hil.chain import LIFT, ChainConfig, FlightChain
-from dreamer_racing.hil.flyer import Flyer, check_contract, check_flown_by_betaflight, check_ranges, check_rate_loop
+from dreamer_racing.hil.flyer import (
+    Flyer,
+    check_contract,
+    check_flown_by_betaflight,
+    check_ranges,
+    check_rate_loop,
+    thrust_note,
+)
 from dreamer_racing.hil.links import BATTERY_LINKS, LINKS, LinkConfig
 from dreamer_racing.hil.links.sitl import MSP_PORT
 from dreamer_racing.hil.operator import (
@@ -39,6 +47,7 @@ PILOT_RATE = 50.0  # Hz
 SIMULATED = ("simulated", "betaflight_sitl")  # links to simulated vehicles, which can hurt nobody
 ARMING = tuple(link for link in BETAFLIGHT if link != "msp_override")  # links that arm by a channel
 OPERATORS = ("keyboard", "udp", "timed")
+THRUST_NUMBERS = ("mass", "full_thrust", "reference_voltage", "voltage")  # settings that make a `ThrustMap`
 WITHOUT_BODY_RATES = ("PoseStamped", "VISION_POSITION_ESTIMATE", "ATT_POS_MOCAP")  # messages without body rates
 SPARE = 5.0  # s added to the flight of actor=identify for its take-off
 UNLIMITED_RATE = 1e4  # rad/s: as good as no limit
@@ -167,13 +176,14 @@ def check_read(config: HilConfig) -> None:
     for names, is_read, reader in (
         (("preset",), config.actor == PILOT, "actor=pilot"),
         (("renderer",), config.actor not in (PILOT, IDENTIFY), "an actor with a camera"),
+        (("rate",), config.actor != IDENTIFY, "an actor other than identify, which flies at a rate of its own"),
         (("force",), config.vehicle is not None or config.link in BETAFLIGHT, "vehicle=, or a link to a Betaflight"),
         (("vehicle",), config.actor not in (PILOT, IDENTIFY), "a trained actor"),
         (("baud",), config.device is not None, "device="),
         (("link_host", "link_port"), config.device is None, "a link over the network, without device="),
         (("serial_port",), config.link == "betaflight_sitl", "link=betaflight_sitl"),
         (("arm_channel",), config.link in ARMING, f"link={', '.join(ARMING)}"),
-        (("mass", "full_thrust", "reference_voltage", "voltage"), throttle, "a link that sends a throttle"),
+        (THRUST_NUMBERS, throttle, "a link that sends a throttle"),
         (("voltage_tolerance", "voltage_smoothing"), config.link in BATTERY_LINKS, f"link={', '.join(BATTERY_LINKS)}"),
         (("pose_host", "pose_port"), config.pose_device is None and config.pose != "ros2", "poses over the network"),
         (("pose_device",), config.pose == "mavlink", "pose=mavlink"),
@@ -224,6 +234,8 @@ def check_flight(config: HilConfig, contract: dict[str, Any], track: Track) -> l
             loop = check_flown_by_betaflight(contract, config.link, config.force)
     notes = [] if loop is None else [loop]
     notes += check_ranges(contract, limits_of(config, track), given_limits(config))
+    if (thrust := thrust_map(config)) is not None:
+        notes += thrust_note(contract, thrust.collective_thrust_max)
     if config.betaflight_dump is not None:
         if config.link not in BETAFLIGHT:
             raise ValueError(
@@ -236,6 +248,7 @@ def check_flight(config: HilConfig, contract: dict[str, Any], track: Track) -> l
             )
         count = require_dump(Path(config.betaflight_dump), contract, config.link)
         notes.append(f"flight controller: {count} settings as required (betaflight_dump={config.betaflight_dump})")
+        notes += gains_unlike_training(Path(config.betaflight_dump), contract)
     elif config.arm and config.link in BETAFLIGHT:
         notes.append("flight controller: its settings were not checked; for that give betaflight_dump= of a `dump all`")
     if config.link == "msp_override":
@@ -251,13 +264,18 @@ def given_limits(config: HilConfig) -> dict[str, Any]:
     return {name: value for name, value in vars(config.limits).items() if value is not None}
 
 
+def without_body_rates(config: Mapping[str, Any]) -> bool:
+    """Return whether a configuration's poses carry no body rates, so that these are estimated from attitudes."""
+    message, source = config.get("pose_message"), config.get("pose")
+    return message in WITHOUT_BODY_RATES or (source == "ros2" and message is None)
+
+
 def limits_of(config: HilConfig, track: Track) -> SafetyLimits:
     """Return the safety limits of a flight: the user's, else those of pose source and flyer, else the default.
 
     Body rates estimated from attitudes only lag behind them, and a hovering vehicle is not stranded.
     """
-    estimated = config.pose_message in WITHOUT_BODY_RATES or (config.pose == "ros2" and config.pose_message is None)
-    tolerances = {"rate_tolerance": UNLIMITED_RATE} if estimated else {}
+    tolerances = {"rate_tolerance": UNLIMITED_RATE} if without_body_rates(vars(config)) else {}
     hovers = {"still_time": 3600.0} if config.actor == IDENTIFY else {}
     return SafetyLimits.of_track(track, **tolerances | hovers | given_limits(config))
 
@@ -292,13 +310,18 @@ def stamping_of(config: HilConfig) -> Stamping:
     return Stamping.receive if kernel else Stamping.sender
 
 
+def thrust_map(config: HilConfig) -> ThrustMap | None:
+    """Return the map from throttle to thrust; None if a number of it is not given."""
+    numbers = {name: getattr(config, name) for name in THRUST_NUMBERS}
+    return None if None in numbers.values() else ThrustMap(**numbers)
+
+
 def link_config(config: HilConfig, contract: dict[str, Any], rate: float) -> LinkConfig:
     """Return the link's settings, with the stick rates that `dreamer_racing.hil.betaflight` configures."""
-    numbers = {name: getattr(config, name) for name in ("mass", "full_thrust", "reference_voltage", "voltage")}
-    missing = [name for name, number in numbers.items() if number is None]
+    missing = [name for name in THRUST_NUMBERS if getattr(config, name) is None]
     if missing and config.link not in ("simulated", "udp"):
         raise ValueError(f"{missing[0]}= is missing: link={config.link} needs it to convert thrust to throttle.")
-    thrust = None if missing else ThrustMap(**numbers)
+    thrust = thrust_map(config)
     if thrust is not None:
         check_battery(config, thrust)
     port = 9101 if config.link_port is None and config.link in ("simulated", "udp") else config.link_port

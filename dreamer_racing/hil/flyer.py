@@ -75,9 +75,11 @@ def trained_track(contract: dict[str, Any]) -> Track:
     """Return the track that an actor was trained on, by its name or, if it was a file, its description in the contract.
 
     Raises:
-        TrackError: There is no such track here, or the description is invalid.
+        ValueError: The contract names no track, there is none of its name here, or the description is invalid.
     """
     source = contract["source"]
+    if source.get("track") is None:
+        raise ValueError("The actor's contract names no track (source.track): give track=.")
     if (described := source.get("track_description")) is None:
         return load_track(source["track"])
     return read_track(described, "the contract's source.track_description")
@@ -184,6 +186,21 @@ def _rate_loop_mismatch(trained: dict[str, Any], there: QuadrotorParameters) -> 
             unit = " s" if name == "a motor lag of" else ""
             return f"{name} {known:g}{unit} (± {width:.0%})", f"{name} {other:g}{unit}"
     return None
+
+
+def thrust_note(contract: dict[str, Any], most: float) -> list[str]:
+    """Return a note if a vehicle's largest collective thrust, m/s², is below what an actor's training covered."""
+    channels = {channel["name"]: channel for channel in contract["action"]["channels"]}
+    if (channel := channels.get("collective_thrust")) is None:
+        return []
+    asked = channel["offset"] + abs(channel["scale"])
+    covered = contract["action"].get("trained_half_widths", {}).get("thrust", 0.0)
+    if most >= asked * (1.0 - covered - TOLERANCE):
+        return []
+    return [
+        f"thrust: the actor may ask for {asked:.4g} m/s², and the vehicle gives at most {most:.4g}: more is cut off, "
+        "which training did not cover"
+    ]
 
 
 def check_ranges(contract: dict[str, Any], limits: SafetyLimits, user_limits: Collection[str] = ()) -> list[str]:

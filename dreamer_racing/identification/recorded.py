@@ -7,16 +7,18 @@ from __future__ import annotations
 
 import csv
 import gzip
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from dreamer_racing.envs.drone.parameters import GRAVITY
-from dreamer_racing.hil.attitude import rotation_matrix
+from dreamer_racing.envs.drone.parameters import GRAVITY, QuadrotorParameters
+from dreamer_racing.hil.attitude import rotation_between, rotation_matrix
+from dreamer_racing.hil.configuration import THRUST_NUMBERS, without_body_rates
 from dreamer_racing.hil.recording import Flight
+from dreamer_racing.hil.sticks import ThrustMap
 
 DT = 0.001  # s, step of the grid
 
@@ -43,6 +45,15 @@ class Recorded:
     fresh: np.ndarray  # (T,) bool: where a command was sent
     rates: np.ndarray  # (T, 3) measured body rates, rad/s; NaN where nothing was measured
     force: np.ndarray  # (T,) measured specific force along body z, m/s²; NaN where nothing was measured
+    # mass, kg, and thrust of all rotors at full command, N, by which the link set the throttle; None: not known
+    assumed: tuple[float, float] | None = None
+
+    def drone(self, nominal: QuadrotorParameters) -> QuadrotorParameters:
+        """Return a drone with the mass and the full thrust that the link assumed, if known."""
+        if self.assumed is None:
+            return nominal
+        mass, thrust = self.assumed
+        return replace(nominal, mass=mass, rotor_thrust_max=thrust / 4)
 
     def excited_seconds(self) -> tuple[float, ...]:
         """Return for how long each axis was moved while it was measured, s: roll, pitch, yaw, thrust."""
@@ -122,13 +133,36 @@ def of_flight(flight: Flight) -> Recorded:
         raise ValueError("This flight was never armed: there is nothing to fit.")
     poses = np.array([packet for tick in flight.ticks for packet in tick["in"]["received"]], float)
     poses = poses[np.unique(poses[:, 2], return_index=True)[1]]  # sorted by timestamp, without duplicates
-    latency = float((flight.about.get("config") or {}).get("latency") or 0.0)
+    config = flight.about.get("config") or {}
+    latency = float(config.get("latency") or 0.0)
     time = poses[:, 2] + (poses[:, 0] - poses[:, 2]).min() - latency  # s, by the loop's clock
     within = (time >= armed[0][0]) & (time <= armed[-1][0])
     time, poses = time[within], poses[within]
     force_time, force = _specific_force(time, poses)
     command_time, command = (np.array(column) for column in zip(*armed, strict=True))
-    return _on_grid(command_time, command, time, poses[:, 13:16], force_time, force)
+    rates = rates_between(time, poses[:, 6:10]) if without_body_rates(config) else poses[:, 13:16]
+    recorded = _on_grid(command_time, command, time, rates, force_time, force)
+    return replace(recorded, assumed=assumed_by(config))
+
+
+def rates_between(time: np.ndarray, attitude: np.ndarray) -> np.ndarray:
+    """Return body rates, rad/s (N, 3), from the attitudes before and after each pose, so that none lags behind.
+
+    Those that the flight used, of poses without body rates, are filtered, and so late by `smoothing=`.
+    """
+    before, after = np.arange(len(time)) - 1, np.arange(len(time)) + 1
+    before[0], after[-1] = 0, len(time) - 1
+    turned = [rotation_between(attitude[first], attitude[second]) for first, second in zip(before, after, strict=True)]
+    return np.array(turned) / np.maximum(time[after] - time[before], 1e-6)[:, None]
+
+
+def assumed_by(config: Mapping[str, Any]) -> tuple[float, float] | None:
+    """Return mass and full thrust of a flight's link as in `ThrustMap`; None for a link without a throttle."""
+    numbers: dict[str, Any] = {name: config.get(name) for name in THRUST_NUMBERS}
+    if None in numbers.values():
+        return None
+    thrust = ThrustMap(**numbers)
+    return thrust.mass, thrust.mass * thrust.collective_thrust_max
 
 
 def _specific_force(time: np.ndarray, poses: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

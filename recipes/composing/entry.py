@@ -22,7 +22,7 @@ from omegaconf.errors import MissingMandatoryValue, OmegaConfBaseException
 from composing.messages import INTERRUPTED, is_follower_rank, say_error
 from composing.options import CONFIG_DIR, FLAGS, no_such_setting
 from dreamer_racing.envs.simulator.opengl import RendererUnavailableError
-from dreamer_racing.settings import check_settings, wrong_choice
+from dreamer_racing.settings import check_settings, is_number, wrong_choice
 from dreamer_racing.terminal import start_logging
 
 
@@ -103,7 +103,7 @@ PLAIN = {
 TEXTS = (
     "run_dir", "resume", "init_from", "checkpoint", "output", "name", "directory", "runs", "commit", "agent", "actor",
     "track", "evaluation", "run", "against", "beside", "picture", "replay", "report", "betaflight_dump",
-    "flight", "vehicle",
+    "flight", "vehicle", "betaflight", "firmware",
 )  # fmt: skip
 """Settings that are always text, even if they look like numbers."""
 
@@ -170,15 +170,16 @@ def normalise_argument(argument: str) -> str:
     """Return an argument, rewritten if hydra would misread or refuse it.
 
     Whole numbers such as 1e6, also in comma-separated lists, are written out in digits, since hydra reads a float. Text
-    (`TEXTS`) that hydra would refuse is quoted, and a leading ~ replaced by the user's home, unless the text contains
-    quotes or the characters of lists and dictionaries.
+    (`TEXTS`) that hydra would refuse or read as a number is quoted, and a leading ~ replaced by the user's home, unless
+    the text contains quotes or the characters of lists and dictionaries.
     """
     name, equals, value = argument.partition("=")
     if not equals:
         return argument
     if override_key(argument) in TEXTS:
-        known = is_parsable(argument) or set(value) & set(",[]{}'\"")
-        return argument if known else as_override(name, os.path.expanduser(value))
+        structured = set(value) & set(",[]{}'\"")
+        is_text = is_parsable(argument) and not is_number(override_value(argument))
+        return argument if structured or is_text else as_override(name, os.path.expanduser(value))
     return f"{name}={','.join(map(_in_digits, value.split(',')))}"
 
 

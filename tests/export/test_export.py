@@ -461,6 +461,8 @@ CHANNEL = {"name": "x", "unit": "m", "offset": 0}
         (spoil("control", {"rate_hz": float("nan")}), ValueError, "rate_hz is nan, not a number"),
         (spoil("control", {"rate_hz": -25}), ValueError, "rate_hz is -25, not above 0"),
         (spoil("control", None), ValueError, "control is None, not an object"),
+        (spoil("source", {"track": 3}), ValueError, "source.track is 3, not a string"),
+        (spoil("rate_loop", {"kind": "betaflight", "p": [45.0]}), ValueError, "rate_loop lacks d, motor_time_const"),
         (spoil("inputs", [{"name": "h", "shape": [1], "type": "float32"}]), ValueError, "inputs lacks z, previous"),
         (spoil("shape", [2**40], of_first_input=True), ValueError, "has the shape .1099511627776"),
         (spoil("type", "object", of_first_input=True), ValueError, "is of type 'object', not uint8"),

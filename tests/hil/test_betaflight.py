@@ -7,8 +7,18 @@ from pathlib import Path
 
 import pytest
 
+from dreamer_racing.envs.drone.parameters import load_preset
+from dreamer_racing.export.contract import describe_rate_loop
 from dreamer_racing.export.onnx_actor import read_contract
-from dreamer_racing.hil.betaflight import LINKS, Status, check_dump, print_settings, rate_map, wanted_settings
+from dreamer_racing.hil.betaflight import (
+    LINKS,
+    Status,
+    check_dump,
+    gains_unlike_training,
+    print_settings,
+    rate_map,
+    wanted_settings,
+)
 from dreamer_racing.hil.betaflight.__main__ import main
 
 CONTRACT = Path(__file__).parents[2] / "agents" / "kidney" / "contract.json"
@@ -291,3 +301,11 @@ def test_the_exit_status_says_what_was_found(monkeypatch, tmp_path, contract, ca
         assert said.out == "" and len(said.err.splitlines()) == 1
     assert run(monkeypatch, "check", "--contract", CONTRACT) == 2
     assert run(monkeypatch, "print", "--contract", CONTRACT, "--dump", dump) == 2
+
+
+def test_gains_that_training_did_not_have_are_said(contract, tmp_path):
+    path, drone = tmp_path / "dump.txt", load_preset("betaflight")
+    path.write_text(dump_of(["set p_roll = 45", "set p_pitch = 50", "set p_yaw = 45"]))
+    assert gains_unlike_training(path, contract) == []  # of an actor of another rate loop
+    (note,) = gains_unlike_training(path, {**contract, "rate_loop": describe_rate_loop(drone)})
+    assert note.startswith("p_yaw is 45, and the actor was trained with 30 ± 20%")

@@ -19,7 +19,14 @@ from dreamer_racing.envs.tracks import load_track
 from dreamer_racing.export.contract import describe_rate_loop
 from dreamer_racing.export.onnx_actor import read_contract
 from dreamer_racing.hil.chain import ChainConfig, FlightChain, describe_outputs, read_inputs
-from dreamer_racing.hil.flyer import Flyer, check_contract, check_flown_by_betaflight, check_ranges, check_rate_loop
+from dreamer_racing.hil.flyer import (
+    Flyer,
+    check_contract,
+    check_flown_by_betaflight,
+    check_ranges,
+    check_rate_loop,
+    trained_track,
+)
 from dreamer_racing.hil.recording import FILE, Flight, FlightRecorder
 from dreamer_racing.hil.safety_limits import SafetyLimits
 from dreamer_racing.hil.sticks import RateMap, ThrustMap, channels
@@ -101,6 +108,15 @@ def test_an_actor_of_another_rate_loop_is_refused_with_both_and_flies_if_forced(
         check_rate_loop(old, "betaflight", force=False)
     unknown = check_rate_loop({"source": {"preset": "mine"}}, "betaflight", force=False)
     assert unknown is not None and "does not describe a rate loop" in unknown
+
+
+@pytest.mark.parametrize("name", sorted(path.parent.name for path in AGENTS.glob("*/contract.json")))
+def test_every_included_agent_is_compared_with_a_vehicle(name):
+    contract = read_contract(AGENTS / name / "contract.json")
+    preset = contract["source"]["preset"]
+    assert check_rate_loop(contract, preset, force=False) is None
+    with pytest.raises(ValueError, match="was trained with"):
+        check_rate_loop(contract, "easy" if preset == "betaflight" else "betaflight", force=False)
 
 
 def test_a_link_to_a_betaflight_is_for_actors_of_its_rate_loop():
@@ -279,3 +295,8 @@ def test_an_accelerometer_of_another_scale_is_refused_on_the_ground() -> None:
     read_imu = plant.plant.vehicle.read_imu
     plant.plant.vehicle.read_imu = lambda: read_imu() * np.array((1.0, 1.0, 1.0, 0.5, 0.5, 0.5))
     assert "its accelerometer reads 4.91 m/s² at rest" in plant.fly(chain, 50.0, 1.0)
+
+
+def test_an_actor_of_no_track_asks_for_one():
+    with pytest.raises(ValueError, match="names no track .* give track="):
+        trained_track({"source": {}})

@@ -19,7 +19,15 @@ from dreamer_racing.hil.recording import FILE, FlightRecorder
 from dreamer_racing.hil.safety import SafetyLimits
 from dreamer_racing.identification import fitting
 from dreamer_racing.identification.fitting import EVERY, PARAMETERS, Model, apply, fit
-from dreamer_racing.identification.recorded import DT, Recorded, of_flight, read_recorded, stretches
+from dreamer_racing.identification.recorded import (
+    DT,
+    Recorded,
+    assumed_by,
+    of_flight,
+    rates_between,
+    read_recorded,
+    stretches,
+)
 from dreamer_racing.plant.delivery import Delivery
 from dreamer_racing.plant.lock_step import LockStep
 from dreamer_racing.plant.vehicle import Mismatch, PlantVehicle
@@ -222,3 +230,20 @@ def test_a_flight_is_read_by_the_clock_of_its_loop() -> None:
     assert np.nanmean(read.force) == pytest.approx(GRAVITY * np.cos(0.4), rel=0.01)
     with pytest.raises(ValueError, match="never armed"):
         of_flight(Flown(armed=False))
+
+
+def test_poses_without_body_rates_give_rates_that_do_not_lag() -> None:
+    """A vehicle that turns to and fro about z, by 200 poses a second."""
+    time = np.arange(400) / 200.0
+    angle, rate = np.sin(10.0 * time), 10.0 * np.cos(10.0 * time)
+    attitude = np.stack((np.cos(angle / 2), 0 * angle, 0 * angle, np.sin(angle / 2)), 1)
+    found = rates_between(time, attitude)
+    np.testing.assert_allclose(found[1:-1, 2], rate[1:-1], atol=0.01)
+    assert not found[:, :2].any()
+
+
+def test_mass_and_thrust_are_those_of_the_flight() -> None:
+    config = {"mass": 0.7, "full_thrust": 30.0, "reference_voltage": 16.0, "voltage": 14.4}
+    drone = replace(commands(1), assumed=assumed_by(config)).drone(NOMINAL)
+    assert (drone.mass, 4 * drone.rotor_thrust_max) == pytest.approx((0.7, 30.0 * 0.9**2))
+    assert assumed_by({**config, "mass": None}) is None and commands(1).drone(NOMINAL) == NOMINAL

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import socket
 from contextlib import ExitStack
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -14,6 +15,7 @@ from dreamer_racing.hil.battery import battery_words
 from dreamer_racing.hil.betaflight import print_settings
 from dreamer_racing.hil.chain import Inputs, describe_inputs, describe_outputs
 from dreamer_racing.hil.links.udp import decode_command
+from dreamer_racing.hil.loop import LoopStatistics
 from dreamer_racing.hil.operator import Operator
 from dreamer_racing.hil.pose import PosePacket, Received
 from dreamer_racing.hil.recording import FILE, TRACK, Flight, FlightRecorder
@@ -58,6 +60,7 @@ hil = recipe_module("hil")
         ),
         ({"actor": "kidney", "pose": "ros2", "pose_port": 9200}, "pose_port=9200 is for poses over the network"),
         ({"actor": "kidney", "operator_port": 9200}, "operator_port=9200 is for operator=udp"),
+        ({"actor": "identify", "track": "circle", "rate": 50.0}, "rate=50.0 is for an actor other than identify"),
         ({"replay": "x", "track": "circle"}, "track= is for new flights, and replay= reads a recorded one"),
         (
             {"report": "x", "limits": flights.LimitsConfig(speed_max=9.0)},
@@ -175,6 +178,28 @@ def test_a_flight_controller_with_other_settings_is_refused_line_by_line(tmp_pat
         flights.check_flight(config, contract, kidney)
     config.arm = False  # to be carried by hand
     assert flights.check_flight(config, contract, kidney) == []
+
+
+def test_a_drone_with_less_thrust_than_training_covered_is_said():
+    drone = {"mass": 0.6, "full_thrust": 16.0, "reference_voltage": 15.0, "voltage": 15.0}
+    config = hil.HilConfig(actor="kidney_betaflight", link="crsf", device="/dev/none", **drone)
+    contract, kidney = hil.make_flyer(config)[1], load_track("kidney")
+    assert flights.check_flight(config, contract, kidney) == []
+    config.full_thrust = 12.0
+    (note,) = flights.check_flight(config, contract, kidney)
+    assert note.startswith("thrust: the actor may ask for 26.66 m/s², and the vehicle gives at most 20:")
+
+
+def test_a_disk_that_is_full_at_the_end_does_not_take_the_summary(tmp_path, monkeypatch, capsys):
+    chain = SimpleNamespace(progress=SimpleNamespace(passes=[]), clock=SimpleNamespace(out_of_order=0))
+    loop = SimpleNamespace(run=lambda *_: "the operator ended it", flew=True, statistics=LoopStatistics())
+    poses, link = SimpleNamespace(rejected=0), SimpleNamespace(dropped=0, thrust=None)
+    flown = hil.Prepared(tmp_path / "gone", load_track("circle"), chain, poses, link, loop)
+    monkeypatch.setattr(hil, "prepare", lambda *_: flown)
+    with pytest.raises(SystemExit) as ended:
+        hil.fly(hil.HilConfig(actor="circle"))
+    told = capsys.readouterr()
+    assert ended.value.code == 1 and "gone" in told.err and "the operator ended it" in told.out
 
 
 def test_a_limit_that_was_set_may_clip_and_is_said():

@@ -164,7 +164,8 @@ SUFFIXES = (".yaml", ".yml")
 def load_preset(preset: str | QuadrotorParameters) -> QuadrotorParameters:
     """Return the parameters of a named preset (`easy`, `faithful`, `betaflight`), a drone file, or those given.
 
-    A drone file, for example of a measured drone, varies a preset, but for the widths of its randomisation::
+    A drone file, for example of a measured drone, varies a preset, whose randomisation stays; drawn delays are moved by
+    the change of ``command_delay``::
 
         preset: betaflight
         parameters:                 # fields of `QuadrotorParameters`, in SI units
@@ -199,7 +200,7 @@ def _read_drone(path: Path) -> QuadrotorParameters:
         there = ", ".join(sorted(PRESETS))
         raise ValueError(f"{path}: preset: {quoted(base)} is not one of {there}{suggestion(base, PRESETS)}.")
     try:
-        return _with_changes(PRESETS[base], changes)
+        return _around_own_delay(PRESETS[base], _with_changes(PRESETS[base], changes))
     except (ValueError, TypeError) as error:
         raise ValueError(f"{path}: {error}") from error
 
@@ -217,6 +218,16 @@ def _with_changes(base: T, changes: Mapping[str, Any]) -> T:
         inner = isinstance(value, dict)
         values[name] = _with_changes(before, value) if inner else tuple(value) if isinstance(value, list) else value
     return replace(base, **values)  # type: ignore[type-var]  # a dataclass, of any kind
+
+
+def _around_own_delay(base: QuadrotorParameters, drone: QuadrotorParameters) -> QuadrotorParameters:
+    """Return a drone whose drawn delays lie around its own as those of ``base`` do; other widths are relative."""
+    widths = drone.randomisation
+    if widths is None:
+        return drone
+    change = drone.command_delay - base.command_delay
+    moved = {name: max(getattr(widths, name) + change, 0.0) for name in ("delay_min", "delay_max")}
+    return replace(drone, randomisation=replace(widths, **moved))
 
 
 def save_drone(path: Path, drone: QuadrotorParameters, about: Mapping[str, Any]) -> None:

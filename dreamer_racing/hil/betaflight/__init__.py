@@ -11,10 +11,20 @@ from dreamer_racing.hil.betaflight.settings import (
     LINKS,
     Status,
     check_dump,
+    gains_unlike_training,
     print_settings,
     rate_map,
     require_dump,
     wanted_settings,
 )
 
-__all__ = ["LINKS", "Status", "check_dump", "print_settings", "rate_map", "require_dump", "wanted_settings"]
+__all__ = [
+    "LINKS",
+    "Status",
+    "check_dump",
+    "gains_unlike_training",
+    "print_settings",
+    "rate_map",
+    "require_dump",
+    "wanted_settings",
+]

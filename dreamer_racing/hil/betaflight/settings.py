@@ -148,6 +148,25 @@ def require_dump(path: Path, contract: dict[str, Any], link: str) -> int:
     return len(findings)
 
 
+def gains_unlike_training(path: Path, contract: dict[str, Any]) -> list[str]:
+    """Return a note on each P gain of a dump outside the range of training; none if the contract has no gains.
+
+    They are not in `wanted_settings`: a real drone, whose rotors have inertia, may need others to turn the same way.
+    """
+    trained = contract.get("rate_loop") or {}
+    if trained.get("kind") != "betaflight":
+        return []
+    names = [f"p_{axis}" for axis in AXES]
+    values, _ = _read_dump(path.read_text(encoding="utf-8", errors="replace"), dict.fromkeys(names, "profile"))
+    width = trained.get("trained_half_widths", {}).get("gains", 0.0)
+    return [
+        f"{name} is {values[name]}, and the actor was trained with {known:g} ± {width:.0%}: measure how the drone "
+        "turns, see docs/betaflight.md"
+        for name, known in zip(names, trained["p"], strict=True)
+        if name in values and abs(float(values[name]) - known) > width * known
+    ]
+
+
 def _read_dump(text: str, sections: dict[str, str]) -> tuple[dict[str, str], tuple[int, int] | None]:
     """Return values by name, of the profiles selected at the end, and the firmware's release if stated."""
     version = re.search(r"^#\s*(\w+) ?/.* (\d+)\.(\d+)\.\d+", text, re.MULTILINE)

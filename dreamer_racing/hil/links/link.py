@@ -39,10 +39,11 @@ class Telemetry(ABC):
     Attributes:
         imu_samples: IMU samples (6,) found so far, oldest first, see `hil.imu`; whoever reads them clears the list.
         rejected: Number of frames that were damaged or without a usable value, and of byte runs that were no frame.
+        unanswered: Number of requests sent since the last answer that a subclass counts; see `ChannelLink`.
     """
 
     def __init__(self) -> None:
-        self.rejected = 0
+        self.rejected = self.unanswered = 0
         self.imu_samples: list[np.ndarray] = []
 
     @abstractmethod
@@ -217,4 +218,6 @@ class ChannelLink(TransportLink):
         frame = self._encode_channels(channels(command, self._rates, self.thrust, self._arm_channel))
         due = self._encoded % ASK_EVERY == 0
         self._encoded += 1
+        if due and self._telemetry is not None:
+            self._telemetry.unanswered += 1
         return frame + (self._request if due else b"") + self._always

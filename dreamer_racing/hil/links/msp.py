@@ -47,6 +47,7 @@ BATTERY_REQUEST = b"$M<" + bytes([0, BATTERY_STATE, BATTERY_STATE])  # request o
 MSP_REQUEST = BATTERY_REQUEST + REQUEST  # request of battery and status, sent every `ASK_EVERY` commands
 OVERRIDE_REQUEST = MSP_REQUEST + BOXIDS_REQUEST  # the same, and a request of the list of modes
 _BATTERY_PAYLOAD = 11
+UNANSWERED = 5  # requests without an answer after which a status is out of date [choice]: a second at 25 Hz
 IMU_REQUEST = b"$M<" + bytes([0, RAW_IMU, RAW_IMU])  # request of an IMU sample: 6 bytes
 GYRO_COUNTS = 16.4  # counts of the gyro per deg/s
 G_COUNTS, G_COUNTS_SITL = 512.0, 256.0
@@ -100,7 +101,7 @@ class MspTelemetry(Telemetry):
             elif kind == RAW_IMU:
                 self._add(self.imu_samples, self._sample(payload) if answered else None)
             elif kind == STATUS and answered:
-                self.status = read_status(payload) or self.status
+                self.status, self.unanswered = read_status(payload) or self.status, 0
             elif kind == BOXIDS and answered:
                 self.boxes = payload
         return voltages
@@ -119,6 +120,8 @@ class MspTelemetry(Telemetry):
         status, boxes = self.status, self.boxes
         if status is None or boxes is None:
             return "no status was received from it"
+        if self.unanswered > UNANSWERED:
+            return f"it has not answered the last {self.unanswered} requests of its status"
         if MSP_OVERRIDE not in boxes:
             return "it has no mode MSP OVERRIDE: see msp_override_channels_mask, and assign the mode to a switch"
         on = {box for bit, box in enumerate(boxes) if status.modes >> bit & 1}

@@ -184,7 +184,10 @@ def test_a_drone_comes_back_from_its_file(tmp_path: Path) -> None:
     )
     path = tmp_path / "made" / "drone.yaml"
     save_drone(path, drone, {"flight": "hil_circle"})
-    assert load_preset(str(path)) == drone
+    read = load_preset(str(path))
+    assert replace(read, randomisation=drone.randomisation) == drone
+    assert read.randomisation is not None
+    assert (read.randomisation.delay_min, read.randomisation.delay_max) == pytest.approx((0.008, 0.038))  # 3 ms later
     assert "gyro_lpf2" not in path.read_text(), "only what differs is written"
     other = tmp_path / "mine.yml"
     other.write_text("preset: faithful\nparameters: {mass: 0.5, drag: [0.1, 0.1, 0.2]}\n")

@@ -168,6 +168,9 @@ def test_beside_a_receiver_nothing_that_is_sent_could_arm(server: socket.socket)
     while link.refusal and time.monotonic() < deadline:
         link.listen()
     assert link.refusal == ""
+    for _ in range(6 * ASK_EVERY):  # it never answers again
+        link.send(Command(True, hover()))
+    assert link.refusal == "it has not answered the last 6 requests of its status"
     firmware.close()
     link.close()
 
