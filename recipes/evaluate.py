@@ -6,7 +6,8 @@
 
 Flies the deterministic and the stochastic policy from the start pose for the track's laps, prints both, and writes
 evaluation.json beside plots, videos and the numbers of each episode. protocol=full does it under every condition of
-docs/evaluation.md, with both presets of physics, and adds evaluation.md. An earlier evaluation is never overwritten.
+docs/evaluation.md, with easy and faithful physics and the agent's own, and adds evaluation.md. An earlier evaluation is
+never overwritten.
 """
 
 import json
@@ -19,7 +20,7 @@ from composing.entry import plain_disk_errors, plain_errors, recipe
 from composing.restoring import FlightConfig, Restored, restore
 
 from dreamer_racing.envs.race.starts import StartSampler
-from dreamer_racing.evaluation.protocol import CONDITIONS, EPISODES, MODES, Result, check_conditions, run_protocol
+from dreamer_racing.evaluation.protocol import CONDITIONS, EPISODES, MODES, Result, check_protocol, run_protocol
 from dreamer_racing.figures.protocol import write_markdown
 from dreamer_racing.figures.report import EvaluationReport, report_condition
 from dreamer_racing.settings import COUNT, NOT_NEGATIVE, SEED, check_choice, setting
@@ -33,7 +34,7 @@ PROTOCOLS = ("nominal", "full")
 class EvaluateConfig(FlightConfig):
     """Configuration of `recipes/evaluate.py`."""
 
-    protocol: str = "nominal"  # nominal | full: every condition of docs/evaluation.md, with both presets
+    protocol: str = "nominal"  # nominal | full: every condition of docs/evaluation.md, with several physics
     # with protocol=nominal: noise of starts, as a multiple of the noise of training
     start_noise: float = setting(0.0, NOT_NEGATIVE)
     run_dir: str | None = None  # null: <run of the checkpoint>/evaluation
@@ -56,7 +57,8 @@ def main(config: EvaluateConfig) -> None:
         restored = restore(config)
         track = restored.trained.saved_track()
         if config.protocol == "full":
-            check_conditions(CONDITIONS, track, config.seed)
+            env = restored.trained.env
+            check_protocol(CONDITIONS, track, config.seed, env.preset, env.control_rate)
         else:
             StartSampler(track, start_noise=config.start_noise)  # refuses noise that the track leaves no room for
         directory = fresh_directory(config.run_dir or RunDirectory(restored.run_dir).evaluation, EVALUATION)
@@ -103,7 +105,7 @@ def evaluate_fully(config: EvaluateConfig, restored: Restored, directory: Path) 
     for result in run_protocol(policy, worlds, config.episodes, num_envs=config.num_envs, seed=config.seed):
         results.append(result)
         say(f"\n{result.preset}, {result.condition}, {result.mode} policy\n{result.evaluation.summary()}")
-        if result.preset == trained.env.preset:
+        if result.preset == Path(trained.env.preset).stem:
             report_condition(RunDirectory(directory), result, config.video_steps)
         path = RunDirectory(directory).evaluations / f"{result.name}.json"
         path.parent.mkdir(exist_ok=True)
@@ -113,7 +115,8 @@ def evaluate_fully(config: EvaluateConfig, restored: Restored, directory: Path) 
 
 def describe(results: list[Result], preset: str) -> dict[str, Any]:
     """Return the contents of evaluation.json: the nominal race as with protocol=nominal, and all conditions."""
-    nominal = {r.mode: r.evaluation.to_dict() for r in results if r.preset == preset and r.condition == "nominal"}
+    own = [result for result in results if result.preset == Path(preset).stem and result.condition == "nominal"]
+    nominal = {result.mode: result.evaluation.to_dict() for result in own}
     return {**nominal, "conditions": [result.to_dict() for result in results]}
 
 

@@ -166,7 +166,7 @@ def prepare(
         weights=metadata["weights"],
         track=name_of(track, trained.track),
         track_sha256=hash_track(track),
-        preset=trained.env.preset,
+        preset=Path(trained.env.preset).name,
         **({} if trained.track_description is None else {"track_description": describe_track(track)}),
     )
     return step, contract, flight
@@ -212,7 +212,7 @@ def describe(
         "algorithm": trained.algorithm,
         "track": Path(trained.track).name,
         "decoys": trained.decoys,
-        "preset": trained.env.preset,
+        "preset": Path(trained.env.preset).name,
         "control_rate": trained.env.control_rate,
         "env_steps": source["env_steps"],
         "weights": source["weights"],
@@ -231,10 +231,11 @@ def history_of(checkpoint: Path, env_steps: int) -> list[dict[str, Any]]:
 
 
 def without_machine(overrides: Iterable[str]) -> list[str]:
-    """Return overrides without those that are specific to a machine, and of a track's file only the name."""
+    """Return overrides without those that are specific to a machine, and of a track's or drone's file only the name."""
     kept = [text for text in overrides if override_key(text) not in MACHINE_SETTINGS]
-    files = {text: Path(str(override_value(text))).name for text in kept if override_key(text) == "track"}
-    return [as_override("track", files[text]) if text in files else text for text in kept]
+    names = {text: override_key(text) for text in kept if override_key(text) in ("track", "env.preset")}
+    files = {text: as_override(name, Path(str(override_value(text))).name) for text, name in names.items()}
+    return [files.get(text, text) for text in kept]
 
 
 def write_agent(folder: Path, trained: WorldModelRunConfig, about: dict[str, Any]) -> None:
@@ -242,7 +243,9 @@ def write_agent(folder: Path, trained: WorldModelRunConfig, about: dict[str, Any
     (folder / AGENT).unlink(missing_ok=True)
     if trained.env.reward is not None:
         print(f"reward: the agent ships without env.reward={trained.env.reward}; its evaluations use Eq. 1")
-    env, track = replace(trained.env, device="cpu", reward=None), Path(trained.track).name  # no folders of this machine
+    track, preset = Path(trained.track).name, Path(trained.env.preset).name  # no folders of this machine
+    env = replace(trained.env, device="cpu", reward=None, preset=preset)
+    RunDirectory(folder).keep_drone(trained.env.preset)
     ships = replace(trained, track=track, run_dir=None, resume=None, device="auto", env=env)
     OmegaConf.save(OmegaConf.structured(ships), folder / CONFIG)
     (folder / AGENT).write_text(json.dumps(about, indent=2, allow_nan=False) + "\n", encoding="utf-8")

@@ -7,8 +7,10 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
+from dreamer_racing.envs.drone.parameters import at_control_rate, load_preset
 from dreamer_racing.envs.race.starts import StartSampler
 from dreamer_racing.envs.simulator.looks import LooksRandomisation
 from dreamer_racing.envs.tracks import Track, displace_gates, load_track
@@ -19,6 +21,7 @@ from dreamer_racing.learners.learner import Policy
 EPISODES = 100
 """Minimum number of episodes per condition."""
 PRESETS = ("easy", "faithful")
+"""Physics that every agent is evaluated with, beside its own."""
 MODES = ("deterministic", "stochastic")
 
 
@@ -88,7 +91,7 @@ CONDITIONS = (
 class Result:
     """Result of one condition with one physics preset and one mode of the policy."""
 
-    preset: str
+    preset: str  # name of the physics
     condition: str
     mode: str
     track: Track  # of the recorded flight; other flights may be on differently displaced tracks
@@ -106,6 +109,11 @@ class Result:
         return {"preset": self.preset, "condition": self.condition, "policy": self.mode, **statistics}
 
 
+def presets_of(own: str) -> tuple[str, ...]:
+    """Return the physics to evaluate with: `PRESETS`, and the agent's own, a preset or a drone file."""
+    return tuple(dict.fromkeys((*PRESETS, own)))
+
+
 def run_protocol(
     policy: Policy,
     worlds: Mapping[str, Any],
@@ -121,7 +129,7 @@ def run_protocol(
 
     Args:
         policy: the policy.
-        worlds: arguments of `DroneRacingEnv`: ``track``, ``camera``, ``renderer``, ``from_pixels``.
+        worlds: arguments of `DroneRacingEnv`: ``track``, ``preset``, ``camera``, ``renderer``, ``from_pixels``.
         episodes: number of episodes per condition.
         conditions: the conditions.
         num_envs: see `Course`.
@@ -129,7 +137,7 @@ def run_protocol(
             the limits that `Course` describes.
     """
     track = load_track(worlds["track"])
-    for preset in PRESETS:
+    for preset in presets_of(worlds.get("preset", PRESETS[0])):
         for condition in conditions:
             if condition.needs_images and not worlds.get("from_pixels", True):
                 continue
@@ -142,15 +150,20 @@ def run_protocol(
                         there, recorded = {**worlds, "preset": preset, **race}, int(race is races[0])
                         deterministic = mode == "deterministic"
                         parts.append(fly(policy, there, share, deterministic, num_envs, num_trajectories=recorded))
-                yield Result(preset, condition.name, mode, races[0]["track"], Evaluation.join(parts))
+                yield Result(Path(preset).stem, condition.name, mode, races[0]["track"], Evaluation.join(parts))
 
 
-def check_conditions(conditions: Sequence[Condition], track: Track, seed: int) -> None:
-    """Check that the track leaves room for all conditions, before any is evaluated.
+def check_protocol(conditions: Sequence[Condition], track: Track, seed: int, preset: str, control_rate: float) -> None:
+    """Check that the track leaves room for all conditions, and all physics allow the rate, before any is evaluated.
 
     Raises:
-        ValueError: it does not; the message names the condition.
+        ValueError: they do not; the message names the condition, or the physics.
     """
+    for physics in presets_of(preset):
+        try:
+            at_control_rate(load_preset(physics), control_rate)
+        except ValueError as error:
+            raise ValueError(f"the protocol cannot be flown with preset={physics}: {error}") from error
     for condition in conditions:
         try:
             for race in condition.races(track, seed):

@@ -284,6 +284,8 @@ def read_evaluation(
     if made["track_sha256"] != track_sha256:
         there = "another track, or with other decoys" if made["track"] == track else made["track"]
         raise ValueError(f"{path} was flown on {there}, and the agent was trained on {track}. {how}")
+    if missing := [mode for mode in MODES if mode not in written]:
+        raise ValueError(f"{path} has no {missing[0]} policy with the agent's own physics. {how}")
     names = ("episodes", "seed", "start_noise", "preset", "decoys", "date", "commit")
     statistics = {mode: {name: value for name, value in written[mode].items() if name not in BY_ITEM} for mode in MODES}
     return {**{name: made[name] for name in names}, **statistics}

@@ -54,7 +54,8 @@ HEADROOM = 0.3  # m above the highest thing drawn
 
 def speed_scale(trajectories: Sequence[Trajectory]) -> Normalize:
     """Return the colour scale from 0 to the highest speed of the flights, rounded up to whole m/s."""
-    top = max(float(np.nanmax(trajectory.speed.numpy())) for trajectory in trajectories)
+    speeds = [trajectory.speed.numpy() for trajectory in trajectories]  # not finite at the end of some flights
+    top = max(float(speed[np.isfinite(speed)].max(initial=0.0)) for speed in speeds)
     return Normalize(0.0, max(1.0, math.ceil(top)))
 
 

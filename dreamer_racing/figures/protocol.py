@@ -13,7 +13,7 @@ from matplotlib.ticker import MaxNLocator, PercentFormatter
 
 from dreamer_racing.envs.simulator.scene import Camera
 from dreamer_racing.evaluation.evaluate import CRASHES, FINISHED, Episode, Evaluation
-from dreamer_racing.evaluation.protocol import CONDITIONS, MODES, PRESETS, Result, report_heading, results_table
+from dreamer_racing.evaluation.protocol import CONDITIONS, MODES, Result, report_heading, results_table
 from dreamer_racing.evaluation.sight import BIN_DEGREES, NEAREST_VISIBLE_GATE, Sight, SightResults, is_race_gate
 from dreamer_racing.figures.drawing import (
     DASHED,
@@ -70,11 +70,13 @@ def write_markdown(directory: Path, results: Sequence[Result], provenance: dict[
     title = f"{provenance['algorithm']} on {provenance['track']}, {provenance['env_steps']:,} env_steps"
     into = RunDirectory(directory).plots
     plot_conditions(results, into / "conditions.png", title)
-    for preset in dict.fromkeys(result.preset for result in results):
+    presets = list(dict.fromkeys(result.preset for result in results))
+    for preset in presets:
         flown = {r.mode: r.evaluation for r in results if r.preset == preset and r.condition == "nominal"}
         plot_crashes(flown, into / f"crashes_{preset}.png", f"{title}, nominal, {preset}")
     meanings = "\n".join(f"- `{condition.name}`: {condition.meaning}" for condition in CONDITIONS)
-    plots = "\n\n".join(f"![{name}](plots/{name}.png)" for name in ("conditions", *(f"crashes_{p}" for p in PRESETS)))
+    names = ("conditions", *(f"crashes_{preset}" for preset in presets))
+    plots = "\n\n".join(f"![{name}](plots/{name}.png)" for name in names)
     text = f"{report_heading(title, provenance)}\n{results_table(results)}\n{meanings}\n\n{plots}\n"
     (directory / "evaluation.md").write_text(text, encoding="utf-8")
 

@@ -7,7 +7,7 @@ import hashlib
 import os
 import re
 from collections import defaultdict
-from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 from itertools import combinations, groupby, pairwise
@@ -29,11 +29,12 @@ LOGGED_BY = (
 """Columns of `metrics.csv` that identify the algorithm: the first one that exists decides."""
 REFERENCE = "default"  # name of the variant that others are compared with, as is a variant without a name
 SAME_CURVE = (
-    "seed", "run_dir", "resume", "total_env_steps", "device", "logger.", "checkpoint.", "replay.storage",
+    "seed", "run_dir", "resume", "device", "logger.", "checkpoint.", "replay.storage",
     "replay.device", "evaluation.every", "evaluation.first", "evaluation.stochastic", "evaluation.video_steps",
     "model.cuda_graph",
 )  # fmt: skip
 """Names or prefixes of settings in which the runs of one curve may differ, because they do not affect learning."""
+LENGTH = "total_env_steps"  # affects learning only through schedules
 IN_KEY = ("algorithm", "track", "task")  # settings that every key contains
 
 
@@ -187,8 +188,19 @@ def read_runs(directories: Sequence[Path], wanted: Collection[str] | None = None
             problems.append(f"{directory.name} left out: {reason}")
         else:
             runs.append(run)
-            problems += [f"{directory.name}: {problem}" for problem in run.metrics.problems]
+            problems += [f"{directory.name}: {problem}" for problem in (*run.metrics.problems, *_changes(directory))]
     return _one_run_per_seed(runs, problems), problems
+
+
+def _changes(directory: Path) -> Iterator[str]:
+    """Yield a line for every start of a run, but the first, that changed settings which affect learning."""
+    if directory.is_dir():
+        noted = RunDirectory(directory).read_starts()
+        starts = [(start, _relevant(_as_settings(start["overrides"]))) for start in noted]
+        for (_, before), (start, now) in pairwise(starts):
+            if changed := sorted(name for name in before.keys() | now.keys() if before.get(name) != now.get(name)):
+                at = f"{start['env_steps']:,} env_steps"
+                yield f"resumed at {at} with other {', '.join(changed)}; drawn with its last settings"
 
 
 def _one_run_per_seed(runs: Sequence[RunData], problems: list[str]) -> list[RunData]:
@@ -216,6 +228,8 @@ def _read_config(directory: Path) -> dict[str, Any]:
     flat = dict(flatten(config))
     if described := flat.get("track_description"):  # long; a hash suffices to compare tracks
         flat["track_description"] = hashlib.sha256(str(described).encode()).hexdigest()[:8]
+    if (drone := RunDirectory(directory).drone).exists():  # likewise
+        flat["env.preset"] = f"{drone.name} {hashlib.sha256(drone.read_bytes()).hexdigest()[:8]}"
     return flat
 
 
@@ -225,8 +239,12 @@ def _read_overrides(directory: Path) -> dict[str, str]:
         overrides = yaml.safe_load(RunDirectory(directory).overrides.read_text(encoding="utf-8"))
     except (OSError, yaml.YAMLError, UnicodeDecodeError):
         return {}
-    pairs = (str(item).lstrip("+~").partition("=") for item in (overrides if isinstance(overrides, list) else ()))
-    return {name: value for name, _, value in pairs}
+    return _as_settings(overrides if isinstance(overrides, list) else ())
+
+
+def _as_settings(overrides: Iterable[Any]) -> dict[str, str]:
+    """Return the values of overrides by name."""
+    return {name: value for name, _, value in (str(item).lstrip("+~").partition("=") for item in overrides)}
 
 
 def flatten(config: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
@@ -308,7 +326,15 @@ def _split_by_settings(runs: Sequence[RunData]) -> list[list[RunData]]:
 def _differing_settings(first: Mapping[str, Any], second: Mapping[str, Any]) -> list[str]:
     """Return the names of settings that affect learning and differ between two configurations that both have them."""
     common = first.keys() & second.keys()
+    if not (_has_ramp_by_length(first) or _has_ramp_by_length(second)):
+        common -= {LENGTH}
     return sorted(name for name in common if not name.startswith(SAME_CURVE) and first[name] != second[name])
+
+
+def _has_ramp_by_length(config: Mapping[str, Any]) -> bool:
+    """Return whether a schedule depends on the run's length, so that runs of other lengths learn differently."""
+    ends = [name for name, value in config.items() if re.fullmatch(r"schedule\..+\.to", name) and value is not None]
+    return any(config.get(f"{name.removesuffix('to')}by") != "passes" for name in ends)
 
 
 def _difference_labels(parts: Sequence[Sequence[RunData]]) -> list[str]:

@@ -20,6 +20,7 @@ from torchrl.checkpoint import Checkpoint, CheckpointError
 from dreamer_racing import parallel
 from dreamer_racing.caches import why_not_writable
 from dreamer_racing.commands import from_here
+from dreamer_racing.envs.drone.parameters import SUFFIXES
 
 logger = logging.getLogger(__name__)
 
@@ -58,6 +59,7 @@ class RunDirectory:
 
     checkpoints = _Below(CHECKPOINTS)  # folder of checkpoints, from which the run can be resumed
     config = _Below("config.yaml")  # resolved configuration of the latest start
+    drone = _Below("drone.yaml")  # content of env.preset= at the latest start, if it was a file
     overrides = _Below("overrides.yaml")  # list of the overrides that it was composed from
     starts = _Below("starts.jsonl")  # a line of JSON for every start of the run; see `note_start`
     metrics = _Below("metrics.csv")  # table of metrics over env_steps
@@ -139,6 +141,13 @@ class RunDirectory:
         line = {"env_steps": env_steps, "overrides": list(overrides), "commit": commit}
         with self.starts.open("a", encoding="utf-8") as file:
             file.write(json.dumps({"date": f"{datetime.now(UTC):%Y-%m-%d %H:%M}", **line}) + "\n")
+
+    def keep_drone(self, preset: str) -> None:
+        """Keep the content of a drone file, with which the run's evaluations fly, whatever becomes of the file."""
+        if not preset.endswith(SUFFIXES):
+            self.drone.unlink(missing_ok=True)
+        elif Path(preset).absolute() != self.drone.absolute():
+            replace_text(self.drone, Path(preset).read_text(encoding="utf-8"))
 
     def read_starts(self) -> list[dict[str, Any]]:
         """Return all recorded starts."""

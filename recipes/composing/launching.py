@@ -195,6 +195,7 @@ def write_configuration(directory: RunDirectory, config: RunConfig, overrides: S
     """Write a run's configuration, also beside its best checkpoint, and its overrides; note this start."""
     for place in (directory, directory.best):
         replace_text(place.config, OmegaConf.to_yaml(OmegaConf.structured(config)))
+        place.keep_drone(config.env.preset)
     kept = [override for override in overrides if not override.startswith("resume=")]
     replace_text(directory.overrides, OmegaConf.to_yaml(OmegaConf.create(kept)))
     directory.note_start(env_steps, kept, git_commit(Path(__file__).parent))

@@ -94,7 +94,7 @@ class Restored:
             "track": self.trained.track,
             "track_sha256": hash_track(self.trained.saved_track()),
             "decoys": self.trained.decoys,
-            "preset": self.trained.env.preset,
+            "preset": Path(self.trained.env.preset).name,
             "control_rate": self.trained.env.control_rate,
             "worlds_device": self.trained.env.device,
             "renderer": self.trained.env.renderer,

@@ -92,6 +92,12 @@ def test_every_condition_is_flown_by_both_policies():
         assert record["crashes_by_gate"][outcome] == [5, 0, 0, 0]
 
 
+def test_an_agent_is_evaluated_with_its_own_physics_too():
+    own = WORLDS | {"preset": "betaflight"}
+    results = protocol.run_protocol(Falling(), own, episodes=1, conditions=[by_name("nominal")], num_envs=1)
+    assert [result.preset for result in results] == ["easy"] * 2 + ["faithful"] * 2 + ["betaflight"] * 2
+
+
 def test_both_policies_meet_the_same_starts():
     (race,) = by_name("start_noise").races(load_track("circle"), seed=1)
     first, second = (
@@ -123,12 +129,14 @@ def test_table_and_plots(tmp_path, figures):
 
 def test_conditions_that_a_track_has_no_room_for_are_refused_before_any_is_flown():
     circle = load_track("circle")
-    protocol.check_conditions(protocol.CONDITIONS, circle, seed=0)
+    protocol.check_protocol(protocol.CONDITIONS, circle, 0, "easy", 50.0)
     gate = circle.gates[0]
     near = tuple(a - 1.2 * b for a, b in zip(gate.position, gate.forward, strict=True))
     crowded = dataclasses.replace(circle, start_position=near)
+    with pytest.raises(ValueError, match=r"cannot be flown with preset=easy: control_rate=200\.0 Hz"):
+        protocol.check_protocol(protocol.CONDITIONS, circle, 0, "betaflight", 200.0)
     with pytest.raises(ValueError, match=r"condition start_noise cannot be flown on circle: start_noise=2"):
-        protocol.check_conditions(protocol.CONDITIONS, crowded, seed=0)
+        protocol.check_protocol(protocol.CONDITIONS, crowded, 0, "easy", 50.0)
 
 
 def test_intervals_of_bars():

@@ -22,6 +22,7 @@ from dreamer_racing.figures.curves import (
 )
 from dreamer_racing.figures.plotting import evaluation_files, evaluation_score
 from dreamer_racing.figures.runs import CurveKey, find_runs, first_of_each_curve, group_runs, read_runs
+from dreamer_racing.training.directory import RunDirectory
 from dreamer_racing.training.metrics import read_metrics
 
 
@@ -307,6 +308,27 @@ def test_runs_that_differ_in_what_does_not_matter_are_one_curve(tmp_path):
     runs, _ = read_runs(find_runs([tmp_path]))
     assert [[run.seed for run in group] for group in group_runs(runs).values()] == [[0, 1]]
     assert [run.seed for run in first_of_each_curve(runs)] == [0]
+
+
+def test_a_ramp_over_the_run_makes_its_length_matter(tmp_path):
+    for folder, by, curves in (("a", "run", 2), ("b", "passes", 1)):
+        for seed in (0, 1):
+            schedule = {"rates": {"to": 0.3, "by": by}}
+            run = f"dreamer_v3_circle_seed{seed}"
+            write_run(tmp_path / folder, run, seed=seed, total_env_steps=10 + seed, schedule=schedule)
+        runs, _ = read_runs(find_runs([tmp_path / folder]))
+        assert len(group_runs(runs)) == curves
+
+
+def test_a_run_that_was_resumed_with_other_settings_is_named(tmp_path):
+    write_run(tmp_path, "dreamer_v3_circle_seed0", seed=0)
+    directory = RunDirectory(tmp_path / "dreamer_v3_circle_seed0")
+    directory.note_start(0, ["track=circle"], None)
+    directory.note_start(500, ["track=circle", "device=cpu"], None)
+    directory.note_start(1000, ["track=circle", "loss.entropy_scale=0.1"], None)
+    _, problems = read_runs(find_runs([tmp_path]))
+    words = "resumed at 1,000 env_steps with other loss.entropy_scale; drawn with its last settings"
+    assert problems == [f"dreamer_v3_circle_seed0: {words}"]
 
 
 def test_of_the_same_seed_twice_the_longer_run_counts(tmp_path):

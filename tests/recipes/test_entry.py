@@ -30,6 +30,7 @@ from tests.running_recipes import CONFIG, ROOT, TINY, compose, open_session, rec
         ("betaflight=2026.10", "betaflight='2026.10'"),
         ("resume=läufe/k=1 (2)", "resume='läufe/k=1 (2)'"),
         ("resume=~/k1", f"resume={Path.home()}/k1"),
+        ("env.preset=~/drone.yaml", f"env.preset={Path.home()}/drone.yaml"),
         ("init_from=~/2 runs/k1", f"init_from={Path.home()}/2 runs/k1"),
         ("runs=läufe/k1,läufe/k2", "runs=läufe/k1,läufe/k2"),
         ("total_env_steps=1e5,2e5,7", "total_env_steps=100000,200000,7"),

@@ -159,7 +159,9 @@ def test_a_run_keeps_the_track_of_a_file_that_is_gone(track: Track, tmp_path: Pa
     pytest.importorskip("onnxruntime")
     file, directory, agent = tmp_path / "tracks" / "mine.yaml", tmp_path / "run", tmp_path / "mine"
     write(track, file)
-    short = [override for override in TINY if not override.startswith("track=")]
+    drone = tmp_path / "drone.yaml"
+    drone.write_text("preset: easy\nparameters: {mass: 0.62}\n")
+    short = [override for override in TINY if not override.startswith("track=")] + [f"env.preset={drone}"]
     completed("dreamer_v3", f"track={file}", *short, "run_dir=run", cwd=tmp_path, before=UNDRAWN)
     write(load_track("circle"), file)
     longer = ["budget=none", "total_env_steps=240"]
@@ -173,10 +175,13 @@ def test_a_run_keeps_the_track_of_a_file_that_is_gone(track: Track, tmp_path: Pa
     export = ("export", f"checkpoint={directory}", "agent=mine", "commit=abc1234")
     assert "was flown on another track, or" in refused(*export, cwd=tmp_path)
     file.unlink()
+    drone.unlink()
     completed("evaluate", "checkpoint=run", *EVALUATION, cwd=tmp_path, before=UNDRAWN)
     completed(*export, cwd=tmp_path)
     contract = read_contract(agent / "contract.json")
     assert (contract["source"]["track"], trained_track(contract)) == ("mine.yaml", track)
+    assert (agent / "drone.yaml").read_text() == (directory / "drone.yaml").read_text()
+    assert contract["action"]["trained_mass_kg"] == 0.62
     texts = [path.read_text() for path in agent.iterdir() if path.suffix in (".json", ".yaml")]
     assert not any(str(tmp_path) in text for text in texts), "paths of this machine"
     completed("fly", f"agent={agent}", cwd=tmp_path)

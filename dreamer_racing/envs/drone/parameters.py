@@ -87,7 +87,7 @@ class QuadrotorParameters:
     collective_thrust_scale: float = setting(13.33, POSITIVE)  # m/s²: c = scale · (1 + a) [rpg]
     rate_gain: float = setting(15.0, POSITIVE)  # 1/s, proportional body-rate loop [choice]
     betaflight: BetaflightParameters | None = None  # replaces the proportional loop and its mixer
-    command_delay: float = setting(0.0, NOT_NEGATIVE)  # s
+    command_delay: float = setting(0.0, NOT_NEGATIVE)  # s; with a `randomisation` the delay is drawn by that
     physics_dt: float = setting(0.002, POSITIVE)  # s [rpg]
     control_dt: float = setting(0.02, POSITIVE)  # s, 50 Hz [rpg]
     integrator: str = "Euler"  # one of `INTEGRATORS`

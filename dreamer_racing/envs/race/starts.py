@@ -196,7 +196,7 @@ class StartSampler:
         force = line.dynamics.force(velocity, pace.square() * reference.acceleration)
         ahead = line.at(time + self.LOOK_AHEAD).position - reference.position
         attitude = turn(_pointing(force, ahead), self._attitude_noise * noise[:, 3:])
-        on_line = (draw[:, 0] < self._on_line).unsqueeze(-1)
+        on_line = ((draw[:, 0] < self._on_line) & ~self._in_a_frame(position)).unsqueeze(-1)
         return StartPose(
             position=torch.where(on_line, position, pose.position),
             attitude=torch.where(on_line, attitude, pose.attitude),
