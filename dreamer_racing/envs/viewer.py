@@ -1,16 +1,13 @@
-"""Interactive viewers: `RaceWindow`, MuJoCo's viewer of a running flight, and `view("kidney")`, dm_control's viewer.
+"""`RaceWindow`, MuJoCo's viewer of a running flight.
 
-They need a display. Without one, both report what is missing instead of failing inside GLFW; record a video or call
-`env.physics.render(480, 640, camera_id="spectator")` instead. In either window F1 lists the keys; in dm_control's,
-`[` and `]` switch between the free camera, the drone's `nose` and the `spectator`.
+It needs a display; without one, it reports what is missing instead of failing inside GLFW. F1 lists its keys.
 """
 
 import os
 import sys
 import threading
 import time
-from collections.abc import Callable, Mapping, Sequence
-from typing import Any
+from collections.abc import Mapping
 
 import mujoco
 import numpy as np
@@ -123,63 +120,13 @@ def _compile_open_scene(worlds: RaceWorlds) -> mujoco.MjModel:
     return spec.compile()
 
 
-def view(
-    track: Any = "kidney", preset: Any = "easy", policy: Callable[[Any], np.ndarray] | None = None, **arguments: Any
-) -> None:
-    """Open `dm_control.viewer` on the race of one drone; return when the window is closed.
-
-    Args:
-        track: name of a built-in track, path to a YAML file, or a `Track`.
-        preset: physics preset (`easy`, `faithful`, `betaflight`) or parameters.
-        policy: maps a dm_env `TimeStep` to an action (4,); None hovers.
-        arguments: further arguments of `envs.load`.
-
-    Raises:
-        ViewerUnavailableError: no window can be opened here.
-    """
-    check_viewer()
-    from dreamer_racing.envs.dm_control_env import load
-
-    # isort: split
-    from dm_control import viewer
-
-    viewer.launch(load(track, preset, **arguments), policy=policy or hover)
-
-
-def hover(time_step: Any) -> np.ndarray:
-    """Return the action (4,) that holds altitude when level; the observation is ignored."""
-    from dreamer_racing.envs.drone.parameters import QuadrotorParameters
-
-    return np.array([QuadrotorParameters().hover_action, 0.0, 0.0, 0.0], np.float32)
-
-
-def check_viewer(environment: Mapping[str, str] = os.environ) -> None:
-    """Check that dm_control can open a window with these environment variables, before it tries.
-
-    Raises:
-        ViewerUnavailableError: it cannot; the message is one paragraph that names everything that is missing.
-    """
-    chosen = environment.get("MUJOCO_GL", "").lower()
-    windowless = []
-    if chosen not in ("", "glfw", "enable", "enabled", "on", "true", "1"):
-        windowless.append(f"MUJOCO_GL={chosen} selects rendering without a window (unset it, or set MUJOCO_GL=glfw)")
-    try:
-        check_window(environment, windowless)
-    except ViewerUnavailableError as error:
-        raise ViewerUnavailableError(
-            f"{error}. Without a window, images come from env.physics.render(480, 640, camera_id='spectator') (EGL or "
-            "OSMesa) and from the environments' pixels."
-        ) from error
-
-
-def check_window(environment: Mapping[str, str] = os.environ, missing: Sequence[str] = ()) -> None:
+def check_window(environment: Mapping[str, str] = os.environ) -> None:
     """Check that a window can be opened with these environment variables, before MuJoCo tries.
 
     Raises:
         ViewerUnavailableError: it cannot; the message, without a full stop, names everything that is missing.
     """
-    missing = [*_missing_display(environment), *missing] or _missing_glfw()
-    if missing:
+    if missing := _missing_display(environment) or _missing_glfw():
         raise ViewerUnavailableError(f"The viewer cannot open a window here: {'; '.join(missing)}")
 
 

@@ -1,7 +1,6 @@
 """The process of a simulated drone: datagrams in and out, and physics that keeps up with a clock.
 
-`Plant` has no clock. One of two loops advances it: `fly_in_real_time` by the wall clock, `fly_in_lock_step` by the
-commands.
+`Plant` has no clock: `fly_in_real_time` advances it by the wall clock.
 """
 
 from __future__ import annotations
@@ -39,14 +38,12 @@ _PORT = Range(1, 65535)
 
 @dataclass
 class ProcessOptions:
-    """Where a plant's datagrams go, and by which clock it flies."""
+    """Where a plant's datagrams go, and how long it flies."""
 
     host: str = "127.0.0.1"  # to listen on and to send to
     command_port: int = setting(9101, Range(0, 65535))  # port on which commands arrive; 0: a free one
     pose_port: int = setting(9100, _PORT)  # port to which poses are sent
     failsafe: float = setting(TIMEOUT, Range(0.02, 10))  # s without a command after which motors are cut
-    speed: float = setting(1.0, Range(0.05, 20))  # s of physics per s of the wall clock
-    lock_step: bool = False  # no clock: only commands advance the physics, each by one control step of the preset
     duration: float | None = setting(None, POSITIVE)  # s of physics; null: until it is stopped
     betaflight: str | None = None  # release of a running firmware (SITL), as 4.6 or 2026.6: fly by its motors
     # set up and start a firmware, and fly by its motors: its program, or auto: BETAFLIGHT_SITL, or the extra sitl
@@ -137,38 +134,22 @@ class Plant:
         )
 
 
-def fly_in_real_time(
-    plant: Plant, incoming: socket.socket, stop: GracefulExit, speed: float = 1.0, duration: float = math.inf
-) -> None:
-    """Fly by the wall clock, counted from now; delays are caught up with, and do not add up.
-
-    The speed is in s of physics per s of the clock, the duration in s of physics.
-    """
-    start = time.monotonic() - plant.time / speed
+def fly_in_real_time(plant: Plant, incoming: socket.socket, stop: GracefulExit, duration: float = math.inf) -> None:
+    """Fly for so many s by the wall clock, counted from now; delays are caught up with, and do not add up."""
+    start = time.monotonic() - plant.time
     while not stop.requested and plant.time < duration:
-        wait = start + min(plant.due, duration) / speed - time.monotonic()
+        wait = start + min(plant.due, duration) - time.monotonic()
         if -wait > LATE:
             plant.late += 1
             plant.latest = max(plant.latest, -wait)
         if select.select([incoming], [], [], min(max(wait, 0.0), _PATIENCE))[0]:
-            now = min((time.monotonic() - start) * speed, duration)
-            if now < plant.due + LATE * speed:  # else physics is late: as if datagrams arrived at its present time
+            now = min(time.monotonic() - start, duration)
+            if now < plant.due + LATE:  # else physics is late: as if datagrams arrived at its present time
                 plant.advance_to(now)
             for data in _drain(plant, incoming):
                 plant.take(data)
         elif wait <= _PATIENCE:
             plant.advance_to(min(plant.due, duration))
-
-
-def fly_in_lock_step(
-    plant: Plant, incoming: socket.socket, stop: GracefulExit, period: float, duration: float = math.inf
-) -> None:
-    """Fly without a clock: only commands advance the physics, each by one ``period`` in s, for ``duration`` s of it."""
-    while not stop.requested and plant.time < duration - _ROUNDING:
-        if select.select([incoming], [], [], _PATIENCE)[0]:
-            for data in _drain(plant, incoming):
-                if plant.take(data):
-                    plant.advance_to(plant.time + period)
 
 
 def _drain(plant: Plant, incoming: socket.socket) -> list[bytes]:
@@ -188,13 +169,8 @@ def check_process(options: ProcessOptions) -> None:
     incoming, outgoing = "command_port", ["pose_port"]
     if options.betaflight is not None:
         convention_of(options.betaflight)
-    if name := firmware_option(options):
+    if firmware_option(options):
         incoming, outgoing = "motor_port", ["pose_port", "state_port"]
-        if options.lock_step or options.speed != 1.0:
-            given = getattr(options, name)
-            raise ValueError(f"{name}={given}: it needs the wall clock; leave lock_step=false and speed=1.")
-    if options.lock_step and options.speed != 1.0:
-        raise ValueError(f"speed={options.speed}: has no effect with lock_step=true, which has no clock; leave it out.")
     for name in outgoing:
         if getattr(options, name) == getattr(options, incoming):
             raise ValueError(f"{incoming} and {name} are both {getattr(options, name)}: give each its own port.")
@@ -278,10 +254,7 @@ def run(
         with GracefulExit() as stop:
             host, port = sockets.incoming.getsockname()
             logger.info("plant: %s, listens on %s:%d, poses to %d", vehicle.track.name, host, port, options.pose_port)
-            if options.lock_step:
-                fly_in_lock_step(plant, sockets.incoming, stop, vehicle.control_dt, duration)
-            else:
-                fly_in_real_time(plant, sockets.incoming, stop, options.speed, duration)
+            fly_in_real_time(plant, sockets.incoming, stop, duration)
     finally:
         sockets.close()
         if firmware is not None:

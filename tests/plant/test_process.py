@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import math
 import socket
-import threading
-import time
 from collections.abc import Callable, Iterator
 
 import numpy as np
@@ -13,13 +11,13 @@ import pytest
 
 from dreamer_racing.envs.drone.parameters import GRAVITY
 from dreamer_racing.hil.inlet import bind
-from dreamer_racing.hil.links.udp import CommandPacket, UdpLink, encode_command
-from dreamer_racing.hil.pose import PosePacket, UdpPose, decode_pose
-from dreamer_racing.hil.vehicle import Command, Setpoint, at_rest, hover
+from dreamer_racing.hil.links.udp import CommandPacket, encode_command
+from dreamer_racing.hil.pose import PosePacket, decode_pose
+from dreamer_racing.hil.vehicle import Command, at_rest, hover
 from dreamer_racing.plant import process
 from dreamer_racing.plant.commands import CommandReceiver
 from dreamer_racing.plant.delivery import Delivery
-from dreamer_racing.plant.process import Plant, ProcessOptions, check_process, fly_in_lock_step, fly_in_real_time
+from dreamer_racing.plant.process import Plant, ProcessOptions, check_process, fly_in_real_time
 from dreamer_racing.plant.vehicle import PlantVehicle
 from dreamer_racing.settings import check_settings
 from dreamer_racing.training.signals import GracefulExit
@@ -121,59 +119,6 @@ def test_real_time_does_not_drift_and_catches_up(
     assert "late 13 times (by 55 ms at most)" in plant.summary()
 
 
-def test_four_times_as_fast_takes_a_quarter_of_the_time(
-    fresh: PlantVehicle, incoming: socket.socket, clock: Clock
-) -> None:
-    plant, poses = make(fresh, rate=100.0)
-    fly_in_real_time(plant, incoming, GracefulExit(), speed=4.0, duration=1.2)
-    assert clock.now - 1000.0 == pytest.approx(0.3) and len(poses) == 121 and not plant.late
-
-
-def lock_step_flight(incoming: socket.socket, commands: int) -> tuple[Plant, list[PosePacket]]:
-    """Fly by commands that are sent only when the last one's poses have come."""
-    receiver = UdpPose(0)
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as out:
-        out.connect(receiver.address)
-        plant, _ = make(PlantVehicle("circle", "faithful"), out.send, rate=100.0, position_noise=0.001, seed=4)
-        link, poses = UdpLink(*incoming.getsockname()), []
-        thread = threading.Thread(
-            target=fly_in_lock_step, args=(plant, incoming, GracefulExit(), 0.02), kwargs={"duration": 0.02 * commands}
-        )
-        thread.start()
-        for count in range(commands):
-            thrust = GRAVITY + 0.5 * math.sin(count)
-            link.send(at_rest() if count < 2 else Command(True, Setpoint(thrust, np.array((0.1, 0.0, 0.2)))))
-            deadline = time.monotonic() + 5.0
-            while len(poses) < 2 * (count + 1) + 1 and time.monotonic() < deadline:
-                poses += [received.packet for received in receiver.poll()]
-        thread.join(5.0)
-    link.close()
-    receiver.close()
-    return plant, poses
-
-
-def test_lock_step_flies_one_control_step_a_command_and_always_the_same(incoming: socket.socket) -> None:
-    begin = time.monotonic()
-    flights = [lock_step_flight(incoming, 100) for _ in range(2)]
-    took = time.monotonic() - begin
-    for plant, poses in flights:
-        assert plant.time == pytest.approx(2.0) and len(poses) == 201
-        assert not plant.vehicle.on_stand and not plant.late
-    for one, two in zip(flights[0][1], flights[1][1], strict=True):
-        assert one.stamp == two.stamp and (one.position == two.position).all() and (one.attitude == two.attitude).all()
-    assert took < 20.0
-
-
-def test_nothing_but_a_command_makes_a_lock_step(fresh: PlantVehicle, incoming: socket.socket) -> None:
-    plant, _ = make(fresh)
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as out:
-        for data in (packet(0, at_rest()), packet(0, at_rest()), b"?", packet(4, at_rest())):
-            out.sendto(data, incoming.getsockname())
-    fly_in_lock_step(plant, incoming, GracefulExit(), 0.02, duration=0.04)
-    assert plant.time == pytest.approx(0.04)
-    assert "2 commands (3 lost, 1 stale, 1 malformed)" in plant.summary()
-
-
 @pytest.mark.parametrize(
     ("options", "message"),
     [
@@ -181,10 +126,7 @@ def test_nothing_but_a_command_makes_a_lock_step(fresh: PlantVehicle, incoming: 
         ({"betaflight": "2026.6", "state_port": 9100, "motor_port": 9100}, "motor_port and pose_port are both 9100"),
         ({"betaflight": "4"}, "betaflight=4: must be a firmware release, as 4.6 or 2026.6, or before"),
         ({"betaflight": "new"}, "betaflight=new: must be a firmware release"),
-        ({"betaflight": "4.6", "lock_step": True}, "betaflight=4.6: it needs the wall clock"),
-        ({"firmware": "auto", "speed": 2.0}, "firmware=auto: it needs the wall clock"),
         ({"firmware": "auto", "state_port": 9002}, "motor_port and state_port are both 9002"),
-        ({"lock_step": True, "speed": 2.0}, "no effect with lock_step=true"),
     ],
 )
 def test_what_excludes_each_other_is_refused(options: dict[str, object], message: str) -> None:
@@ -192,7 +134,7 @@ def test_what_excludes_each_other_is_refused(options: dict[str, object], message
         check_process(ProcessOptions(**options))
 
 
-@pytest.mark.parametrize("options", [{"speed": 0.0}, {"pose_port": 0}])
+@pytest.mark.parametrize("options", [{"failsafe": 0.0}, {"pose_port": 0}])
 def test_impossible_numbers_are_refused(options: dict[str, float]) -> None:
     with pytest.raises(ValueError, match=f"{next(iter(options))}=.*must be at least"):
         check_settings(ProcessOptions(**options))
