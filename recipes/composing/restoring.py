@@ -48,7 +48,7 @@ class FlightConfig:
     # worlds that fly in parallel; null: one per episode, so that every policy flies the same races
     num_envs: int | None = setting(None, COUNT)
     track: str | None = None  # null: the track it was trained on
-    decoys: str | None = None  # +decoys=paper | none; null: as in training
+    decoys: str | None = None  # +decoys=paper | none; null: as in training, or none if track= is given
     preset: str | None = None  # null: the physics it was trained on
     run_dir: str | None = None  # null: the run directory of the checkpoint
     device: str = "auto"

@@ -267,7 +267,7 @@ def at_control_rate(parameters: QuadrotorParameters, rate: float | None) -> Quad
     check_numbers({}, {"control_rate": rate})
     if not rate >= MIN_CONTROL_RATE:
         raise ValueError(
-            f"control_rate={rate} Hz: must be at least {MIN_CONTROL_RATE:g}: a control step may pass only one gate."
+            f"control_rate={rate} Hz: must be at least {MIN_CONTROL_RATE:g}: a control step may pass at most two gates."
         )
     steps = round(1.0 / (rate * parameters.physics_dt))
     if steps < 1 or abs(rate * steps * parameters.physics_dt - 1.0) > 1e-6:
