@@ -105,7 +105,7 @@ def evaluate_fully(config: EvaluateConfig, restored: Restored, directory: Path) 
     for result in run_protocol(policy, worlds, config.episodes, num_envs=config.num_envs, seed=config.seed):
         results.append(result)
         say(f"\n{result.preset}, {result.condition}, {result.mode} policy\n{result.evaluation.summary()}")
-        if result.preset == Path(trained.env.preset).stem:
+        if result.preset == Path(trained.env.preset).name:
             report_condition(RunDirectory(directory), result, config.video_steps)
         path = RunDirectory(directory).evaluations / f"{result.name}.json"
         path.parent.mkdir(exist_ok=True)
@@ -115,7 +115,7 @@ def evaluate_fully(config: EvaluateConfig, restored: Restored, directory: Path) 
 
 def describe(results: list[Result], preset: str) -> dict[str, Any]:
     """Return the contents of evaluation.json: the nominal race as with protocol=nominal, and all conditions."""
-    own = [result for result in results if result.preset == Path(preset).stem and result.condition == "nominal"]
+    own = [result for result in results if result.preset == Path(preset).name and result.condition == "nominal"]
     nominal = {result.mode: result.evaluation.to_dict() for result in own}
     return {**nominal, "conditions": [result.to_dict() for result in results]}
 

@@ -28,6 +28,7 @@ from composing.schema import WorldModelRunConfig, is_race
 from omegaconf import MISSING, OmegaConf
 from torch import set_num_threads
 
+from dreamer_racing.envs.drone.parameters import name_of_preset
 from dreamer_racing.envs.imu import load_imu
 from dreamer_racing.envs.torchrl_env import DroneRacingEnv
 from dreamer_racing.envs.tracks import BUILTIN_TRACKS, Track, describe_track, hash_track, load_track
@@ -125,7 +126,8 @@ def export(config: ExportConfig) -> None:
     names = [*(file["name"] for file in read_contract(output.parent / CONTRACT)["files"].values()), CONTRACT]
     if about:
         write_agent(output.parent, trained, about)
-        names += [CONFIG, AGENT]
+        drone = RunDirectory(output.parent).drone
+        names += [CONFIG, AGENT, *([drone.name] if drone.exists() else [])]
     for line in measure_latencies(step, flight, output, config.parts):
         print(line)
     size = sum((output.parent / name).stat().st_size for name in names)
@@ -207,6 +209,7 @@ def describe(
         training["starts"] = history
     weights, track = contract["weights_sha256"], source["track_sha256"]
     evaluation = Path(config.evaluation or newest_evaluation(results_of(checkpoint), weights, track))
+    preset = name_of_preset(trained.env.preset)
     how = f"Make it with: {command('evaluate')} checkpoint={shlex.quote(config.checkpoint)} episodes=100"
     return {
         "algorithm": trained.algorithm,
@@ -217,7 +220,7 @@ def describe(
         "env_steps": source["env_steps"],
         "weights": source["weights"],
         "training": training,
-        "evaluation": read_evaluation(evaluation, checkpoint, weights, trained.track, track, how),
+        "evaluation": read_evaluation(evaluation, checkpoint, weights, trained.track, track, preset, how),
     }
 
 

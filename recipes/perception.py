@@ -99,7 +99,7 @@ def fly_corrupted(config: PerceptionConfig, restored: Restored, start_noise: flo
         for mode in MODES:
             policy = CorruptedPolicy(restored.flyer.evaluation_policy(), make())
             flown = fly(policy, worlds, config.episodes, mode == "deterministic", config.num_envs, num_trajectories=0)
-            results.append(Result(trained.env.preset, name, mode, worlds["track"], flown))
+            results.append(Result(Path(trained.env.preset).name, name, mode, worlds["track"], flown))
             say(f"\n{name} images, {mode} policy, start noise {start_noise:g}\n{flown.summary()}")
     return results
 

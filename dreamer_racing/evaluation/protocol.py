@@ -150,7 +150,7 @@ def run_protocol(
                         there, recorded = {**worlds, "preset": preset, **race}, int(race is races[0])
                         deterministic = mode == "deterministic"
                         parts.append(fly(policy, there, share, deterministic, num_envs, num_trajectories=recorded))
-                yield Result(Path(preset).stem, condition.name, mode, races[0]["track"], Evaluation.join(parts))
+                yield Result(Path(preset).name, condition.name, mode, races[0]["track"], Evaluation.join(parts))
 
 
 def check_protocol(conditions: Sequence[Condition], track: Track, seed: int, preset: str, control_rate: float) -> None:

@@ -260,15 +260,15 @@ def newest_evaluation(folder: Path, weights_sha256: str, track_sha256: str) -> P
 
 
 def read_evaluation(
-    path: Path, checkpoint: Path, weights_sha256: str, track: str, track_sha256: str, how: str
+    path: Path, checkpoint: Path, weights_sha256: str, track: str, track_sha256: str, preset: str, how: str
 ) -> dict[str, Any]:
-    """Return the statistics of an evaluation of these weights on the track that they were trained on, for agent.json.
+    """Return the statistics of an evaluation of these weights in the race that they were trained for, for agent.json.
 
     Messages end with ``how``, a sentence that says how to make the evaluation.
 
     Raises:
         FileNotFoundError: There is none.
-        ValueError: It is of other weights or another track, or no evaluation.
+        ValueError: It is of other weights, another track or other physics (`name_of_preset`), or no evaluation.
     """
     if not path.is_file():
         raise FileNotFoundError(f"There is no evaluation {path}: an agent ships with its results. {how}")
@@ -284,8 +284,8 @@ def read_evaluation(
     if made["track_sha256"] != track_sha256:
         there = "another track, or with other decoys" if made["track"] == track else made["track"]
         raise ValueError(f"{path} was flown on {there}, and the agent was trained on {track}. {how}")
-    if missing := [mode for mode in MODES if mode not in written]:
-        raise ValueError(f"{path} has no {missing[0]} policy with the agent's own physics. {how}")
+    if (there := made["preset"]) != preset:
+        raise ValueError(f"{path} was flown with preset={there}, and the agent was trained with {preset}. {how}")
     names = ("episodes", "seed", "start_noise", "preset", "decoys", "date", "commit")
     statistics = {mode: {name: value for name, value in written[mode].items() if name not in BY_ITEM} for mode in MODES}
     return {**{name: made[name] for name in names}, **statistics}

@@ -17,6 +17,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import yaml
 
+from dreamer_racing.envs.drone.parameters import name_of_preset
 from dreamer_racing.envs.tracks.loading import BUILTIN_TRACKS
 from dreamer_racing.settings import check_choice
 from dreamer_racing.training.directory import RunDirectory
@@ -177,10 +178,11 @@ def read_runs(directories: Sequence[Path], wanted: Collection[str] | None = None
     for directory in directories:
         try:
             if directory.is_file():
-                run = RunData(directory, {}, read_metrics(directory, wanted))
+                run, changes = RunData(directory, {}, read_metrics(directory, wanted)), []
             else:
                 metrics = read_metrics(RunDirectory(directory).metrics, wanted)
                 run = RunData(directory, _read_config(directory), metrics, _read_overrides(directory))
+                changes = _changes(directory)
         except FileNotFoundError as error:
             problems.append(f"{directory.name} left out: it has no {Path(error.filename).name}")
         except (ValueError, OSError) as error:
@@ -188,19 +190,26 @@ def read_runs(directories: Sequence[Path], wanted: Collection[str] | None = None
             problems.append(f"{directory.name} left out: {reason}")
         else:
             runs.append(run)
-            problems += [f"{directory.name}: {problem}" for problem in (*run.metrics.problems, *_changes(directory))]
+            problems += [f"{directory.name}: {problem}" for problem in (*run.metrics.problems, *changes)]
     return _one_run_per_seed(runs, problems), problems
 
 
-def _changes(directory: Path) -> Iterator[str]:
-    """Yield a line for every start of a run, but the first, that changed settings which affect learning."""
-    if directory.is_dir():
-        noted = RunDirectory(directory).read_starts()
-        starts = [(start, _relevant(_as_settings(start["overrides"]))) for start in noted]
-        for (_, before), (start, now) in pairwise(starts):
-            if changed := sorted(name for name in before.keys() | now.keys() if before.get(name) != now.get(name)):
-                at = f"{start['env_steps']:,} env_steps"
-                yield f"resumed at {at} with other {', '.join(changed)}; drawn with its last settings"
+def _changes(directory: Path) -> list[str]:
+    """Return a line for every start of a run, but the first, that changed settings which affect learning."""
+    try:
+        noted = [
+            (start["env_steps"], _relevant(_as_settings(start["overrides"])))
+            for start in RunDirectory(directory).read_starts()
+        ]
+    except (KeyError, TypeError) as error:
+        raise ValueError(f"{RunDirectory(directory).starts} is damaged: {error!r}") from error
+    lines = []
+    for (_, before), (env_steps, now) in pairwise(noted):
+        names = (before.keys() | now.keys()) - {LENGTH}
+        if changed := sorted(name for name in names if before.get(name) != now.get(name)):
+            words = f"with other {', '.join(changed)}; drawn with its last settings"
+            lines.append(f"resumed at {env_steps:,} env_steps {words}")
+    return lines
 
 
 def _one_run_per_seed(runs: Sequence[RunData], problems: list[str]) -> list[RunData]:
@@ -228,8 +237,8 @@ def _read_config(directory: Path) -> dict[str, Any]:
     flat = dict(flatten(config))
     if described := flat.get("track_description"):  # long; a hash suffices to compare tracks
         flat["track_description"] = hashlib.sha256(str(described).encode()).hexdigest()[:8]
-    if (drone := RunDirectory(directory).drone).exists():  # likewise
-        flat["env.preset"] = f"{drone.name} {hashlib.sha256(drone.read_bytes()).hexdigest()[:8]}"
+    if "env.preset" in flat:
+        flat["env.preset"] = name_of_preset(RunDirectory(directory).kept_preset(str(flat["env.preset"])))
     return flat
 
 
@@ -342,6 +351,8 @@ def _difference_labels(parts: Sequence[Sequence[RunData]]) -> list[str]:
     if len(parts) == 1:
         return [""]
     overrides = [_relevant(part[0].overrides) for part in parts]
+    if not any(_has_ramp_by_length(run.config) for part in parts for run in part):
+        overrides = [{name: value for name, value in each.items() if name != LENGTH} for each in overrides]
     names = {name for one in overrides for name in one if any(other.get(name) != one[name] for other in overrides)}
     labels = _name_by(overrides, sorted(names))
     if len(set(labels)) == len(labels):

@@ -48,7 +48,6 @@ SIMULATED = ("simulated", "betaflight_sitl")  # links to simulated vehicles, whi
 ARMING = tuple(link for link in BETAFLIGHT if link != "msp_override")  # links that arm by a channel
 OPERATORS = ("keyboard", "udp", "timed")
 THRUST_NUMBERS = ("mass", "full_thrust", "reference_voltage", "voltage")  # settings that make a `ThrustMap`
-WITHOUT_BODY_RATES = ("PoseStamped", "VISION_POSITION_ESTIMATE", "ATT_POS_MOCAP")  # messages without body rates
 SPARE = 5.0  # s added to the flight of actor=identify for its take-off
 UNLIMITED_RATE = 1e4  # rad/s: as good as no limit
 
@@ -234,7 +233,7 @@ def check_flight(config: HilConfig, contract: dict[str, Any], track: Track) -> l
             loop = check_flown_by_betaflight(contract, config.link, config.force)
     notes = [] if loop is None else [loop]
     notes += check_ranges(contract, limits_of(config, track), given_limits(config))
-    if (thrust := thrust_map(config)) is not None:
+    if config.actor not in (PILOT, IDENTIFY) and (thrust := thrust_map(config)) is not None:
         notes += thrust_note(contract, thrust.collective_thrust_max)
     if config.betaflight_dump is not None:
         if config.link not in BETAFLIGHT:
@@ -267,7 +266,7 @@ def given_limits(config: HilConfig) -> dict[str, Any]:
 def without_body_rates(config: Mapping[str, Any]) -> bool:
     """Return whether a configuration's poses carry no body rates, so that these are estimated from attitudes."""
     message, source = config.get("pose_message"), config.get("pose")
-    return message in WITHOUT_BODY_RATES or (source == "ros2" and message is None)
+    return message in WITHOUT_VELOCITIES or (source == "ros2" and message is None)
 
 
 def limits_of(config: HilConfig, track: Track) -> SafetyLimits:

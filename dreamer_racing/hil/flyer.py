@@ -189,18 +189,20 @@ def _rate_loop_mismatch(trained: dict[str, Any], there: QuadrotorParameters) -> 
 
 
 def thrust_note(contract: dict[str, Any], most: float) -> list[str]:
-    """Return a note if a vehicle's largest collective thrust, m/s², is below what an actor's training covered."""
+    """Return a note if a vehicle's largest collective thrust, m/s², is less than an actor may ask for.
+
+    What training's randomisation took off, of the same drone, is not said.
+    """
     channels = {channel["name"]: channel for channel in contract["action"]["channels"]}
     if (channel := channels.get("collective_thrust")) is None:
         return []
     asked = channel["offset"] + abs(channel["scale"])
-    covered = contract["action"].get("trained_half_widths", {}).get("thrust", 0.0)
-    if most >= asked * (1.0 - covered - TOLERANCE):
+    widths = contract["action"].get("trained_half_widths", {})
+    weaker, sagging, heavier = (widths.get(name, 0.0) for name in ("thrust", "sag_max", "mass"))
+    if most >= asked * (1.0 - weaker) * (1.0 - sagging) / (1.0 + heavier):
         return []
-    return [
-        f"thrust: the actor may ask for {asked:.4g} m/s², and the vehicle gives at most {most:.4g}: more is cut off, "
-        "which training did not cover"
-    ]
+    there = f"the vehicle gives at most {most:.4g}: more is cut off"
+    return [f"thrust: the actor may ask for {asked:.4g} m/s², and {there}"]
 
 
 def check_ranges(contract: dict[str, Any], limits: SafetyLimits, user_limits: Collection[str] = ()) -> list[str]:

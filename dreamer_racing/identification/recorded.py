@@ -140,20 +140,22 @@ def of_flight(flight: Flight) -> Recorded:
     time, poses = time[within], poses[within]
     force_time, force = _specific_force(time, poses)
     command_time, command = (np.array(column) for column in zip(*armed, strict=True))
-    rates = rates_between(time, poses[:, 6:10]) if without_body_rates(config) else poses[:, 13:16]
-    recorded = _on_grid(command_time, command, time, rates, force_time, force)
+    rate_time, rates = time, poses[:, 13:16]
+    if without_body_rates(config):
+        rate_time, rates = rates_between(time, poses[:, 6:10])
+    recorded = _on_grid(command_time, command, rate_time, rates, force_time, force)
     return replace(recorded, assumed=assumed_by(config))
 
 
-def rates_between(time: np.ndarray, attitude: np.ndarray) -> np.ndarray:
-    """Return body rates, rad/s (N, 3), from the attitudes before and after each pose, so that none lags behind.
+def rates_between(time: np.ndarray, attitude: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return times, s, and body rates then, rad/s (N, 3), each from two attitudes of which one pose lies between.
 
-    Those that the flight used, of poses without body rates, are filtered, and so late by `smoothing=`.
+    They do not lag, unlike those that the flight used, which are filtered (`smoothing=`). None spans a gap.
     """
-    before, after = np.arange(len(time)) - 1, np.arange(len(time)) + 1
-    before[0], after[-1] = 0, len(time) - 1
-    turned = [rotation_between(attitude[first], attitude[second]) for first, second in zip(before, after, strict=True)]
-    return np.array(turned) / np.maximum(time[after] - time[before], 1e-6)[:, None]
+    turned = np.array([rotation_between(*pair) for pair in zip(attitude[:-2], attitude[2:], strict=True)])
+    apart = time[2:] - time[:-2]
+    kept = apart <= LONGEST_GAP
+    return (0.5 * (time[2:] + time[:-2]))[kept], (turned / np.maximum(apart, 1e-6)[:, None])[kept]
 
 
 def assumed_by(config: Mapping[str, Any]) -> tuple[float, float] | None:

@@ -144,10 +144,20 @@ class RunDirectory:
 
     def keep_drone(self, preset: str) -> None:
         """Keep the content of a drone file, with which the run's evaluations fly, whatever becomes of the file."""
-        if not preset.endswith(SUFFIXES):
-            self.drone.unlink(missing_ok=True)
-        elif Path(preset).absolute() != self.drone.absolute():
+        if preset.endswith(SUFFIXES) and Path(preset).absolute() != self.drone.absolute():
             replace_text(self.drone, Path(preset).read_text(encoding="utf-8"))
+
+    def kept_preset(self, preset: str) -> str:
+        """Return the preset of a saved configuration, of which a drone file is the kept one.
+
+        Raises:
+            FileNotFoundError: The drone file is not there.
+        """
+        if not preset.endswith(SUFFIXES):
+            return preset
+        if not self.drone.exists():
+            raise FileNotFoundError(f"There is no {self.drone}: copy {preset} there, with which it was trained.")
+        return str(self.drone)
 
     def read_starts(self) -> list[dict[str, Any]]:
         """Return all recorded starts."""

@@ -103,7 +103,7 @@ PLAIN = {
 TEXTS = (
     "run_dir", "resume", "init_from", "checkpoint", "output", "name", "directory", "runs", "commit", "agent", "actor",
     "track", "evaluation", "run", "against", "beside", "picture", "replay", "report", "betaflight_dump",
-    "flight", "vehicle", "betaflight", "firmware", "preset", "env.preset", "flights", "dreams",
+    "flight", "vehicle", "betaflight", "firmware", "preset", "env.preset", "dreams",
 )  # fmt: skip
 """Settings that are always text, even if they look like numbers."""
 

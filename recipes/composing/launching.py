@@ -29,6 +29,7 @@ from composing.saved import (
 from composing.schema import RunConfig, WorldModelRunConfig, is_race
 from dreamer_racing import parallel
 from dreamer_racing.commands import from_here
+from dreamer_racing.envs.drone.parameters import SUFFIXES
 from dreamer_racing.experience.rollouts import WorkerError
 from dreamer_racing.export.agents import agent_path
 from dreamer_racing.export.shipped_agent import is_agent
@@ -243,10 +244,9 @@ def resumed_config(algorithm: str, resume: str, overrides: list[str]) -> tuple[D
                 f"{run_dir} was trained with {name}={trained}, which cannot change: leave {override} out, or start a "
                 "new run."
             )
-    saved_overrides = [
-        text for text in map(str, read_yaml(directory.overrides, ListConfig)) if override_key(text) != "run_dir"
-    ]
-    merged = merge_overrides([*saved_overrides, as_override("run_dir", run_dir)], overrides)
+    saved = map(str, read_yaml(directory.overrides, ListConfig))
+    kept = {"run_dir": run_dir, **({"env.preset": known.env.preset} if known.env.preset.endswith(SUFFIXES) else {})}
+    merged = merge_overrides(merge_overrides(saved, [as_override(*each) for each in kept.items()]), overrides)
     config = hydra.compose(algorithm, merged)
     restore_saved_settings(config, known, {override_key(override) for override in overrides})
     config.track_description = known.track_description  # even if tuned= or budget= is given

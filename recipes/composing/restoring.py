@@ -14,6 +14,7 @@ from composing.building import Environment, make_env, make_learner, serialize_tr
 from composing.saved import trained_config
 from composing.schema import RunConfig, WorldModelRunConfig, is_race
 from dreamer_racing.devices import choose_device
+from dreamer_racing.envs.drone.parameters import name_of_preset
 from dreamer_racing.envs.torchrl_env import DroneRacingEnv
 from dreamer_racing.envs.tracks import hash_track
 from dreamer_racing.export.actor_step import ActorStep
@@ -94,7 +95,7 @@ class Restored:
             "track": self.trained.track,
             "track_sha256": hash_track(self.trained.saved_track()),
             "decoys": self.trained.decoys,
-            "preset": Path(self.trained.env.preset).name,
+            "preset": name_of_preset(self.trained.env.preset),
             "control_rate": self.trained.env.control_rate,
             "worlds_device": self.trained.env.device,
             "renderer": self.trained.env.renderer,

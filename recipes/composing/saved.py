@@ -39,8 +39,7 @@ def saved_config(run_dir: Path) -> DictConfig:
         raise ValueError(f"{path} cannot be read: {reason}. Use the version that wrote it.") from error
     if missing := sorted(OmegaConf.missing_keys(config)):
         raise ValueError(f"{path} is damaged: it lacks {shortened(', '.join(missing))}.")
-    if (drone := RunDirectory(run_dir).drone).exists():
-        config.env.preset = str(drone)
+    config.env.preset = RunDirectory(run_dir).kept_preset(config.env.preset)
     return config
 
 

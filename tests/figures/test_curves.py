@@ -324,11 +324,14 @@ def test_a_run_that_was_resumed_with_other_settings_is_named(tmp_path):
     write_run(tmp_path, "dreamer_v3_circle_seed0", seed=0)
     directory = RunDirectory(tmp_path / "dreamer_v3_circle_seed0")
     directory.note_start(0, ["track=circle"], None)
-    directory.note_start(500, ["track=circle", "device=cpu"], None)
+    directory.note_start(500, ["track=circle", "device=cpu", "total_env_steps=1000"], None)
     directory.note_start(1000, ["track=circle", "loss.entropy_scale=0.1"], None)
     _, problems = read_runs(find_runs([tmp_path]))
     words = "resumed at 1,000 env_steps with other loss.entropy_scale; drawn with its last settings"
     assert problems == [f"dreamer_v3_circle_seed0: {words}"]
+    directory.starts.write_text("3\n")
+    runs, (problem,) = read_runs(find_runs([tmp_path]))
+    assert not runs and "left out: starts.jsonl is damaged" in problem
 
 
 def test_of_the_same_seed_twice_the_longer_run_counts(tmp_path):

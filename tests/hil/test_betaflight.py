@@ -309,3 +309,6 @@ def test_gains_that_training_did_not_have_are_said(contract, tmp_path):
     assert gains_unlike_training(path, contract) == []  # of an actor of another rate loop
     (note,) = gains_unlike_training(path, {**contract, "rate_loop": describe_rate_loop(drone)})
     assert note.startswith("p_yaw is 45, and the actor was trained with 30 ± 20%")
+    path.write_text(dump_of(["set p_roll = 45", "set p_pitch = 50"]).replace("dump all", "diff all"))
+    (note,) = gains_unlike_training(path, {**contract, "rate_loop": describe_rate_loop(drone)})
+    assert note.startswith("p_yaw is not in the text, and the actor was trained with 30 ± 20%")

@@ -7,6 +7,7 @@ import signal
 import subprocess
 import sys
 from pathlib import Path
+from typing import get_args, get_type_hints
 
 import hydra
 import pytest
@@ -231,3 +232,13 @@ def test_the_actor_waits_while_the_newest_records_are_not_known(
     latent_ppo.train(config, session)
     session.close()
     assert True in waited and waited[-1] is False and waited == sorted(waited, reverse=True)
+
+
+def test_no_number_is_taken_for_text() -> None:
+    entry = recipe_module("composing.entry")
+    for path in sorted((ROOT / "recipes").glob("*.py")):
+        recipe_module(path.stem)
+    for schema in entry.SCHEMAS.values():
+        kinds = get_type_hints(schema)
+        numbers = {name for name, kind in kinds.items() if {int, float, bool} & {kind, *get_args(kind)}}
+        assert numbers.isdisjoint(entry.TEXTS), schema

@@ -161,9 +161,10 @@ def test_a_run_keeps_the_track_of_a_file_that_is_gone(track: Track, tmp_path: Pa
     write(track, file)
     drone = tmp_path / "drone.yaml"
     drone.write_text("preset: easy\nparameters: {mass: 0.62}\n")
-    short = [override for override in TINY if not override.startswith("track=")] + [f"env.preset={drone}"]
-    completed("dreamer_v3", f"track={file}", *short, "run_dir=run", cwd=tmp_path, before=UNDRAWN)
+    short = [override for override in TINY if not override.startswith("track=")]
+    completed("dreamer_v3", f"track={file}", f"env.preset={drone}", *short, "run_dir=run", cwd=tmp_path, before=UNDRAWN)
     write(load_track("circle"), file)
+    drone.write_text("preset: easy\nparameters: {mass: 0.9}\n")  # for another run
     longer = ["budget=none", "total_env_steps=240"]
     resumed = completed("dreamer_v3", "resume=run", *longer, cwd=tmp_path, before=UNDRAWN)
     assert f"track: {file} has changed since the run started; the run keeps the old track\n" in resumed.stdout

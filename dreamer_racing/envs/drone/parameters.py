@@ -5,6 +5,7 @@ project's choice, as none is published; [rec] the drone in the Betaflight record
 compared.
 """
 
+import hashlib
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, is_dataclass, replace
@@ -183,6 +184,13 @@ def load_preset(preset: str | QuadrotorParameters) -> QuadrotorParameters:
         return _read_drone(Path(preset))
     check_choice("preset", preset, sorted(PRESETS))
     return PRESETS[preset]
+
+
+def name_of_preset(preset: str) -> str:
+    """Return a preset's name; of a drone file its name and a hash of its content, without its folder."""
+    if not preset.endswith(SUFFIXES):
+        return preset
+    return f"{Path(preset).name} {hashlib.sha256(Path(preset).read_bytes()).hexdigest()[:8]}"
 
 
 def _read_drone(path: Path) -> QuadrotorParameters:

@@ -160,10 +160,10 @@ def gains_unlike_training(path: Path, contract: dict[str, Any]) -> list[str]:
     values, _ = _read_dump(path.read_text(encoding="utf-8", errors="replace"), dict.fromkeys(names, "profile"))
     width = trained.get("trained_half_widths", {}).get("gains", 0.0)
     return [
-        f"{name} is {values[name]}, and the actor was trained with {known:g} ± {width:.0%}: measure how the drone "
-        "turns, see docs/betaflight.md"
+        f"{name} is {values.get(name, 'not in the text')}, and the actor was trained with {known:g} ± {width:.0%}: "
+        "measure how the drone turns, see docs/betaflight.md"
         for name, known in zip(names, trained["p"], strict=True)
-        if name in values and abs(float(values[name]) - known) > width * known
+        if name not in values or abs(float(values[name]) - known) > width * known
     ]
 
 

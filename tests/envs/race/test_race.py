@@ -19,7 +19,7 @@ from dreamer_racing.envs.race.pilot import ScriptedPilot
 from dreamer_racing.envs.race.race import Race, RaceStep, RewardWeights
 from dreamer_racing.envs.race.racing_line import START_LINE, plan_racing_line
 from dreamer_racing.envs.race.starts import StartSampler
-from dreamer_racing.envs.tracks import BUILTIN_TRACKS, Gate, Track, load_track, make_track, validate_track
+from dreamer_racing.envs.tracks import BUILTIN_TRACKS, Gate, GateShape, Track, load_track, make_track, validate_track
 from dreamer_racing.envs.worlds import RaceWorlds
 
 CIRCLE = load_track("circle")
@@ -476,6 +476,16 @@ def test_starts_on_the_line_look_where_it_leads_and_push_along_what_it_asks_for(
     assert (axis * force).sum(-1).div(force.norm(dim=-1)).min() > 0.999
     later = line.at(nearest.double() * line.dt + starts.LOOK_AHEAD).position - pose.position
     assert (left * later).sum(-1).abs().max() < 0.1 and (nose * later).sum(-1).min() > 0
+
+
+def test_no_episode_begins_in_the_frame_of_a_narrow_gate(monkeypatch):
+    narrow = dataclasses.replace(CIRCLE, shape=GateShape(opening=0.6))
+    line = plan_racing_line(CIRCLE, load_preset("easy"), START_LINE)
+    starts = sampler(narrow, on_line=1.0, line=line)
+    assert not starts._in_a_frame(starts.sample(20_000).position).any()
+    is_in_a_frame = starts._in_a_frame
+    monkeypatch.setattr(starts, "_in_a_frame", lambda position: torch.zeros(len(position), dtype=torch.bool))
+    assert is_in_a_frame(starts.sample(20_000).position).any(), "the line's noise would carry some there"
 
 
 def test_the_share_of_starts_on_the_line_leaves_the_rest_as_it_was():
