@@ -41,7 +41,7 @@ How well each algorithm flies here, what that took, and the command that runs it
 
 - **Latent PPO is the surest** (`recipes/latent_ppo.py`): with the true state in training it races all three tracks.
 - **DreamerV3** (`recipes/dreamer_v3.py`) learns in imagination. With the true state in training it races them, too, by
-  every seed of today's default (all but one stopped by hand). Success swings on Figure 8, by one seed to its end, and
+  every seed of today's default (all but two stopped by hand). Success swings on Figure 8, by one seed to its end, and
   sampled success on Circle and Kidney, too.
 - **From images alone** both race Circle, where DreamerV3 swings. Neither has raced Kidney; DreamerV3's reasons are
   [partly known](kidney_from_images.md).
@@ -80,9 +80,9 @@ SURE = """## How sure, and what is not shown
 - **Seeds.** One to five runs do not say how the next one goes. Kidney 1 was far behind when cut short, by [two earlier
   defaults](#dreamerv3-earlier-defaults).
 - **Selection.** Settings were chosen on these tracks, by earlier runs of the same seeds, except that DreamerV3 with the
-  true state had not been tried with Circle 3 and Kidney 2.
+  true state had not been tried with Circle 3 and 4, Kidney 2 and Figure 8 2.
 - **Not shown:** a real drone; agents of images alone but on Circle; today's settings on a GPU; the paper's 20 million
-  env_steps. Of DreamerV3 today only Figure 8 1 is a complete run. The gate coordinates are this project's own, so the
+  env_steps. Of DreamerV3 today only Figure 8 1 and 2 are complete runs. The gate coordinates are this project's own, so the
   paper's numbers cannot be compared. [More](what_we_know.md#what-is-not-known).
 - **Commands** below use today's defaults; the originals are behind *Commands, commits, machine*.
 """
