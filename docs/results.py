@@ -42,7 +42,7 @@ How well each algorithm flies here, what that took, and the command that runs it
 - **Latent PPO is the surest** (`recipes/latent_ppo.py`): with the true state in training it races all three tracks.
 - **DreamerV3** (`recipes/dreamer_v3.py`) learns in imagination. With the true state in training it races them, too, by
   every seed of today's default (all but two stopped by hand). Success swings on Figure 8, by one seed to its end, and
-  sampled success on Circle and Kidney, too.
+  sampled success on all three, too.
 - **From images alone** both race Circle, where DreamerV3 swings. Neither has raced Kidney; DreamerV3's reasons are
   [partly known](kidney_from_images.md).
 - **PPO and SAC from images** were only begun. PPO from the true state flies three clean laps after 3 to 11 minutes.
