@@ -82,8 +82,8 @@ SURE = """## How sure, and what is not shown
 - **Selection.** Settings were chosen on these tracks, by earlier runs of the same seeds, except that DreamerV3 with the
   true state had not been tried with Circle 3 and 4, Kidney 2 and Figure 8 2.
 - **Not shown:** a real drone; agents of images alone but on Circle; today's settings on a GPU; the paper's 20 million
-  env_steps. Of DreamerV3 today only Figure 8 1 and 2 are complete runs. The gate coordinates are this project's own, so the
-  paper's numbers cannot be compared. [More](what_we_know.md#what-is-not-known).
+  env_steps. Of DreamerV3 today only Figure 8 1 and 2 are complete runs. The gate coordinates are this project's own, so
+  the paper's numbers cannot be compared. [More](what_we_know.md#what-is-not-known).
 - **Commands** below use today's defaults; the originals are behind *Commands, commits, machine*.
 """
 
