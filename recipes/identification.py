@@ -49,8 +49,8 @@ def main(config: IdentificationConfig) -> None:
         recorded = read_recorded(config.flight)
         recorded.check(f"flight={config.flight}")
         nominal = recorded.drone(load_preset(config.preset))
-        if recorded.assumed is not None:
-            print("assumed, as in the flight: {:g} kg, {:.4g} N at full command".format(*recorded.assumed))
+        if recorded.thrust_map is not None:
+            print(f"as in the flight: {nominal.mass:g} kg, {4 * nominal.rotor_thrust_max:.4g} N at full command")
         logging.getLogger("dreamer_racing.identification").setLevel(logging.INFO)
         found = fit(recorded, nominal)
         if not all(math.isfinite(error) for error in found.errors.values()):

@@ -233,7 +233,7 @@ def check_flight(config: HilConfig, contract: dict[str, Any], track: Track) -> l
             loop = check_flown_by_betaflight(contract, config.link, config.force)
     notes = [] if loop is None else [loop]
     notes += check_ranges(contract, limits_of(config, track), given_limits(config))
-    if config.actor not in (PILOT, IDENTIFY) and (thrust := thrust_map(config)) is not None:
+    if config.actor not in (PILOT, IDENTIFY) and (thrust := thrust_map(vars(config))) is not None:
         notes += thrust_note(contract, thrust.collective_thrust_max)
     if config.betaflight_dump is not None:
         if config.link not in BETAFLIGHT:
@@ -309,9 +309,9 @@ def stamping_of(config: HilConfig) -> Stamping:
     return Stamping.receive if kernel else Stamping.sender
 
 
-def thrust_map(config: HilConfig) -> ThrustMap | None:
-    """Return the map from throttle to thrust; None if a number of it is not given."""
-    numbers = {name: getattr(config, name) for name in THRUST_NUMBERS}
+def thrust_map(config: Mapping[str, Any]) -> ThrustMap | None:
+    """Return the map from throttle to thrust of a configuration; None if a number of it is not given."""
+    numbers: dict[str, Any] = {name: config.get(name) for name in THRUST_NUMBERS}
     return None if None in numbers.values() else ThrustMap(**numbers)
 
 
@@ -320,7 +320,7 @@ def link_config(config: HilConfig, contract: dict[str, Any], rate: float) -> Lin
     missing = [name for name in THRUST_NUMBERS if getattr(config, name) is None]
     if missing and config.link not in ("simulated", "udp"):
         raise ValueError(f"{missing[0]}= is missing: link={config.link} needs it to convert thrust to throttle.")
-    thrust = thrust_map(config)
+    thrust = thrust_map(vars(config))
     if thrust is not None:
         check_battery(config, thrust)
     port = 9101 if config.link_port is None and config.link in ("simulated", "udp") else config.link_port

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import csv
 import gzip
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -16,7 +16,7 @@ import numpy as np
 
 from dreamer_racing.envs.drone.parameters import GRAVITY, QuadrotorParameters
 from dreamer_racing.hil.attitude import rotation_between, rotation_matrix
-from dreamer_racing.hil.configuration import THRUST_NUMBERS, without_body_rates
+from dreamer_racing.hil.configuration import thrust_map, without_body_rates
 from dreamer_racing.hil.recording import Flight
 from dreamer_racing.hil.sticks import ThrustMap
 
@@ -45,15 +45,14 @@ class Recorded:
     fresh: np.ndarray  # (T,) bool: where a command was sent
     rates: np.ndarray  # (T, 3) measured body rates, rad/s; NaN where nothing was measured
     force: np.ndarray  # (T,) measured specific force along body z, m/s²; NaN where nothing was measured
-    # mass, kg, and thrust of all rotors at full command, N, by which the link set the throttle; None: not known
-    assumed: tuple[float, float] | None = None
+    thrust_map: ThrustMap | None = None  # by which the link set the throttle, if it did
 
     def drone(self, nominal: QuadrotorParameters) -> QuadrotorParameters:
         """Return a drone with the mass and the full thrust that the link assumed, if known."""
-        if self.assumed is None:
+        if self.thrust_map is None:
             return nominal
-        mass, thrust = self.assumed
-        return replace(nominal, mass=mass, rotor_thrust_max=thrust / 4)
+        mass = self.thrust_map.mass
+        return replace(nominal, mass=mass, rotor_thrust_max=mass * self.thrust_map.collective_thrust_max / 4)
 
     def excited_seconds(self) -> tuple[float, ...]:
         """Return for how long each axis was moved while it was measured, s: roll, pitch, yaw, thrust."""
@@ -144,11 +143,13 @@ def of_flight(flight: Flight) -> Recorded:
     if without_body_rates(config):
         rate_time, rates = rates_between(time, poses[:, 6:10])
     recorded = _on_grid(command_time, command, rate_time, rates, force_time, force)
-    return replace(recorded, assumed=assumed_by(config))
+    return replace(recorded, thrust_map=thrust_map(config))
 
 
 def rates_between(time: np.ndarray, attitude: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return times, s, and body rates then, rad/s (N, 3), each from two attitudes of which one pose lies between.
+    """Return times (M,), s, and body rates then (M, 3), rad/s, each from two attitudes with one pose between them.
+
+    Times (N,) are those of the attitudes (N, 4), wxyz; M is at most N − 2.
 
     They do not lag, unlike those that the flight used, which are filtered (`smoothing=`). None spans a gap.
     """
@@ -156,15 +157,6 @@ def rates_between(time: np.ndarray, attitude: np.ndarray) -> tuple[np.ndarray, n
     apart = time[2:] - time[:-2]
     kept = apart <= LONGEST_GAP
     return (0.5 * (time[2:] + time[:-2]))[kept], (turned / np.maximum(apart, 1e-6)[:, None])[kept]
-
-
-def assumed_by(config: Mapping[str, Any]) -> tuple[float, float] | None:
-    """Return mass and full thrust of a flight's link as in `ThrustMap`; None for a link without a throttle."""
-    numbers: dict[str, Any] = {name: config.get(name) for name in THRUST_NUMBERS}
-    if None in numbers.values():
-        return None
-    thrust = ThrustMap(**numbers)
-    return thrust.mass, thrust.mass * thrust.collective_thrust_max
 
 
 def _specific_force(time: np.ndarray, poses: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

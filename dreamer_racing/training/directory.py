@@ -151,12 +151,12 @@ class RunDirectory:
         """Return the preset of a saved configuration, of which a drone file is the kept one.
 
         Raises:
-            FileNotFoundError: The drone file is not there.
+            ValueError: The drone file is not there.
         """
         if not preset.endswith(SUFFIXES):
             return preset
         if not self.drone.exists():
-            raise FileNotFoundError(f"There is no {self.drone}: copy {preset} there, with which it was trained.")
+            raise ValueError(f"There is no {self.drone}: copy {preset} there, with which it was trained.")
         return str(self.drone)
 
     def read_starts(self) -> list[dict[str, Any]]:

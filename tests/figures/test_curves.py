@@ -320,6 +320,12 @@ def test_a_ramp_over_the_run_makes_its_length_matter(tmp_path):
         assert len(group_runs(runs)) == curves
 
 
+def test_a_run_whose_drone_file_is_lost_is_left_out(tmp_path):
+    write_run(tmp_path, "dreamer_v3_circle_seed0", seed=0, env={"preset": "drone.yaml"})
+    runs, (problem,) = read_runs(find_runs([tmp_path]))
+    assert not runs and "left out: There is no drone.yaml: copy drone.yaml there" in problem
+
+
 def test_a_run_that_was_resumed_with_other_settings_is_named(tmp_path):
     write_run(tmp_path, "dreamer_v3_circle_seed0", seed=0)
     directory = RunDirectory(tmp_path / "dreamer_v3_circle_seed0")

@@ -14,6 +14,7 @@ import torch
 from dreamer_racing.envs.drone.parameters import GRAVITY, PRESETS
 from dreamer_racing.envs.tracks import load_track
 from dreamer_racing.hil.chain import ChainConfig, FlightChain
+from dreamer_racing.hil.configuration import thrust_map
 from dreamer_racing.hil.identify import IdentificationFlyer
 from dreamer_racing.hil.recording import FILE, FlightRecorder
 from dreamer_racing.hil.safety import SafetyLimits
@@ -22,7 +23,6 @@ from dreamer_racing.identification.fitting import EVERY, PARAMETERS, Model, appl
 from dreamer_racing.identification.recorded import (
     DT,
     Recorded,
-    assumed_by,
     of_flight,
     rates_between,
     read_recorded,
@@ -245,6 +245,6 @@ def test_poses_without_body_rates_give_rates_that_do_not_lag() -> None:
 
 def test_mass_and_thrust_are_those_of_the_flight() -> None:
     config = {"mass": 0.7, "full_thrust": 30.0, "reference_voltage": 16.0, "voltage": 14.4}
-    drone = replace(commands(1), assumed=assumed_by(config)).drone(NOMINAL)
+    drone = replace(commands(1), thrust_map=thrust_map(config)).drone(NOMINAL)
     assert (drone.mass, 4 * drone.rotor_thrust_max) == pytest.approx((0.7, 30.0 * 0.9**2))
-    assert assumed_by({**config, "mass": None}) is None and commands(1).drone(NOMINAL) == NOMINAL
+    assert thrust_map({**config, "mass": None}) is None and commands(1).drone(NOMINAL) == NOMINAL

@@ -218,6 +218,6 @@ class ChannelLink(TransportLink):
         frame = self._encode_channels(channels(command, self._rates, self.thrust, self._arm_channel))
         due = self._encoded % ASK_EVERY == 0
         self._encoded += 1
-        if due and self._telemetry is not None:
+        if due and self._request and self._telemetry is not None:
             self._telemetry.unanswered += 1
         return frame + (self._request if due else b"") + self._always
