@@ -86,7 +86,7 @@ def train(config: DreamerV3RunConfig, session: Session) -> None:
         if session.due("evaluate"):
             session.evaluate()
         if session.due("log"):
-            session.write_row(measure(session, learner, replay, scheduled))
+            session.write_row(measure(session, learner, replay, scheduled) | schedule.hardest_gate())
         session.save_if_due()
 
 

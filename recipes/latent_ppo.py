@@ -99,7 +99,7 @@ def train(config: LatentPPORunConfig, session: Session) -> None:
         if session.due("evaluate"):
             session.evaluate()
         if session.due("log"):
-            session.write_row(measure(session, learner, replay, scheduled))
+            session.write_row(measure(session, learner, replay, scheduled) | schedule.hardest_gate())
         session.save_if_due()
 
 

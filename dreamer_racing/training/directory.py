@@ -6,6 +6,7 @@ import fcntl
 import json
 import logging
 import os
+import shutil
 import socket
 from collections.abc import Sequence
 from contextlib import suppress
@@ -95,9 +96,16 @@ class RunDirectory:
         return self.path / "replay" / f"{PROCESS}{parallel.rank()}"
 
     def claim(self) -> RunLock:
-        """Create the folder if needed, and lock it; see `ensure_writable` and `RunLock`."""
+        """Create the folder if needed, lock it, and delete replays of a killed run that had more processes.
+
+        See `ensure_writable` and `RunLock`.
+        """
         made = not self.path.exists()
-        return RunLock(ensure_writable(self.path), made)
+        lock = RunLock(ensure_writable(self.path), made)
+        for folder in self.replay.parent.glob(f"{PROCESS}*"):
+            if int(folder.name.removeprefix(PROCESS)) >= parallel.num_processes():
+                shutil.rmtree(folder, ignore_errors=True)
+        return lock
 
     def mark_finished(self, env_steps: int) -> None:
         """Mark the run as finished."""
@@ -139,8 +147,9 @@ class RunDirectory:
     def note_start(self, env_steps: int, overrides: Sequence[str], commit: str | None) -> None:
         """Append a start or resume of the run at ``env_steps``, with its overrides and commit, to `starts`."""
         line = {"env_steps": env_steps, "overrides": list(overrides), "commit": commit}
+        torn = self.starts.exists() and not self.starts.read_bytes().endswith(b"\n")  # by a kill, or a full disk
         with self.starts.open("a", encoding="utf-8") as file:
-            file.write(json.dumps({"date": f"{datetime.now(UTC):%Y-%m-%d %H:%M}", **line}) + "\n")
+            file.write("\n" * torn + json.dumps({"date": f"{datetime.now(UTC):%Y-%m-%d %H:%M}", **line}) + "\n")
 
     def keep_drone(self, preset: str) -> None:
         """Keep the content of a drone file, with which the run's evaluations fly, whatever becomes of the file."""

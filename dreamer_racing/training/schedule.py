@@ -235,8 +235,12 @@ class Schedule:
         """Update the gate pass rate by finished episodes, batch ``[E]`` of `EpisodeTracker.update`; return metrics."""
         if not len(episodes) or "gates_passed" not in episodes:
             return {}
-        share = self.pass_rate.update(episodes, env_steps)
-        return {"episode/pass_share": share, "episode/hardest_gate": float(self.pass_rate.lowest_rate_gate)}
+        return {"episode/pass_share": self.pass_rate.update(episodes, env_steps)}
+
+    def hardest_gate(self) -> dict[str, float]:
+        """Return the number of the gate with the lowest pass rate, as a metric; nothing without a race."""
+        passes = self.pass_rate
+        return {"episode/hardest_gate": float(passes.lowest_rate_gate)} if len(passes.shares) else {}
 
     def at(self, env_steps: int) -> dict[str, float]:
         """Return all scheduled hyperparameters at ``env_steps``, by their names in a learner's ``adjust``."""

@@ -28,7 +28,7 @@ from dreamer_racing.settings import COUNT, NOT_NEGATIVE, setting
 from dreamer_racing.training.checkpoint import BestCheckpoint, RunCheckpointError, RunCheckpoints
 from dreamer_racing.training.directory import RunDirectory, RunLock, latest_checkpoint
 from dreamer_racing.training.episodes import EpisodeTracker
-from dreamer_racing.training.metrics import Journal, MetricsLog
+from dreamer_racing.training.metrics import CPU_CLOCK, Journal, MetricsLog
 from dreamer_racing.training.progress import Interval, Periods, Progress, RunClock
 from dreamer_racing.training.signals import GracefulExit
 
@@ -180,6 +180,8 @@ class Session:
             updates = self.counters["updates"]
             logger.info("resumed %s at %s env_steps, %s updates", resume, f"{self.env_steps:,}", f"{updates:,}")
             rollouts.begin_at(self.env_steps)
+        if not rollouts.has_worlds:  # the CPU time of workers on Ray is not known here
+            self._clock.total = {name: seconds for name, seconds in self._clock.total.items() if name != CPU_CLOCK}
         kept = ("learner", "counters", *best)
         self.best = BestCheckpoint(path, {name: self.parts[name] for name in kept}, self.env_steps)
         parallel.run_in_all(lambda: None)  # a barrier: all have read the files that are now rewritten
@@ -214,20 +216,27 @@ class Session:
                 if rollout is None:  # only on a stop, if the next rollout would take too long
                     break
                 yield from self._deliver(rollout)
+            if (rollout := self.collected.drain()) is not None:
+                self._count(rollout)
+                yield rollout
         except WorkerError:
             self.save()
             raise
-        if (rollout := self.collected.drain()) is not None:
-            self._count(rollout)
-            yield rollout
         self._end()
 
     def _deliver(self, rollout: TensorDictBase) -> Iterator[TensorDictBase]:
         """Yield a rollout, and also the one in progress if the run is to be saved or ends."""
         self._count(rollout)
-        under_way = self.collected.drain() if self._saves or self.at_end else None
+        under_way, failure = None, None
+        if self._saves or self.at_end:
+            try:
+                under_way = self.collected.drain()
+            except WorkerError as error:  # raised once this rollout, which is counted, has been learned from
+                failure = error
         self._another_follows = under_way is not None
         yield rollout
+        if failure is not None:
+            raise failure
         if under_way is not None:
             self._count(under_way, saves=self._saves)
             yield under_way
@@ -277,7 +286,7 @@ class Session:
             self._due = {
                 each: ready and self._periods.due(each, self.env_steps, self.at_end) for each in ("log", "evaluate")
             }
-            if self._due["log"]:
+            if self._saves or any(self._due.values()):
                 self._memory.trim()
         return parallel.is_first() and (self._due[name] or (name == "log" and self._due["evaluate"]))
 

@@ -38,6 +38,8 @@ def test_every_start_is_kept(tmp_path: Path, caplog: pytest.LogCaptureFixture) -
     with run.starts.open("a") as file:
         file.write('{damaged}\n{"env_steps": 80')  # killed there
     assert len(run.read_starts()) == 2 and caplog.text.count("is damaged") == 1
+    run.note_start(80, [], "def")  # on a line of its own
+    assert run.read_starts()[-1]["commit"] == "def"
 
 
 def test_a_run_is_finished_where_it_says_so(tmp_path: Path) -> None:
@@ -111,6 +113,14 @@ def test_a_directory_in_use_is_refused_until_it_is_released(tmp_path: Path) -> N
         RunLock(tmp_path)
     lock.release()
     RunLock(tmp_path).release()
+
+
+def test_replays_of_processes_that_are_no_more_are_deleted(tmp_path: Path) -> None:
+    run = RunDirectory(tmp_path)
+    for process in ("process-0", "process-1", "process-12"):
+        (tmp_path / "replay" / process).mkdir(parents=True)
+    run.claim().release()
+    assert [path.name for path in (tmp_path / "replay").iterdir()] == ["process-0"]
 
 
 def test_a_killed_process_holds_nothing(tmp_path: Path) -> None:

@@ -189,11 +189,22 @@ def test_a_loop_may_ask_what_is_due_before_its_last_updates_and_is_still_stopped
     assert run.learner.updates == 42 and not RunDirectory(tmp_path).finished.exists()
 
 
-def test_what_was_delivered_before_workers_were_lost_is_saved(tmp_path: Path) -> None:
-    run = Run(tmp_path, total=40, rollout=4, fails_after=3)
+@pytest.mark.parametrize("every", [0, 10])  # at 12 env_steps the rollout under way is awaited before a save
+def test_what_was_delivered_before_workers_were_lost_is_saved(tmp_path: Path, every: int) -> None:
+    run = Run(tmp_path, total=40, rollout=4, fails_after=3, every=every)
     with pytest.raises(WorkerError):
         run.go()
+    assert run.learner.updates == 12, "of all that was delivered"
     assert [env_steps_of(path) for path in (tmp_path / "checkpoints").glob("checkpoint-*")] == [12]
+    assert run.session._clock.total.keys() == {"wall_clock"}, "the CPU time of the workers is not known"
+
+
+def test_what_was_delivered_is_saved_if_workers_are_lost_at_a_stop(tmp_path: Path) -> None:
+    run = Run(tmp_path, total=40, rollout=4, fails_after=3)
+    run.on_update = lambda updates: os.kill(os.getpid(), signal.SIGTERM) if updates == 12 else None
+    with pytest.raises(WorkerError):
+        run.go()
+    assert run.events == [("saved", 12)]
 
 
 @pytest.mark.parametrize(
