@@ -73,7 +73,10 @@ def main(settings: ExperimentConfig) -> None:
 
 
 def check(config: ExperimentConfig) -> None:
-    """Refuse an unknown algorithm or variant."""
+    """Refuse an unknown algorithm or variant, and what would be the same folder for all runs."""
+    for name in ("run_dir", "resume"):
+        if (value := getattr(config, name)) is not None:
+            raise ValueError(f"{name}={value} is for one run: name a folder for all by directory= and name=.")
     for name, known in (("algorithm", tuple(RECIPES)), ("variant", tuple(config.variants))):
         check_choice(name, getattr(config, name), known)
 

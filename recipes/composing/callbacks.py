@@ -28,7 +28,6 @@ class DrawFigures(Callback):
         from dreamer_racing.terminal import start_logging
 
         start_logging()
-
         place = Path(config.hydra.sweep.dir)
         print(f"figures: {place}/figures")
         try:

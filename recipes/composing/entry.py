@@ -89,17 +89,14 @@ def merge_overrides(saved: Iterable[str], given: Sequence[str]) -> list[str]:
     return [override for override in saved if override_key(override) not in replaced] + list(given)
 
 
-SCHEMAS: dict[str, type] = {}
-"""Configuration dataclasses of the imported recipes, by the recipes' names."""
-WHOLE = re.compile(r"\d{1,9}(\.\d{1,9})?[eE]\+?\d{1,2}")
-"""Pattern of a number such as 1e6."""
-PLAIN = {
+SCHEMAS: dict[str, type] = {}  # configuration dataclasses of the imported recipes, by the recipes' names
+WHOLE = re.compile(r"\d{1,9}(\.\d{1,9})?[eE]\+?\d{1,2}")  # a number such as 1e6
+PLAIN = {  # patterns of the libraries' messages, and the words to print instead
     r"could not be converted to Integer": "is not a whole number",
     r"could not be converted to Float": "is not a number",
     r"is not a valid bool \(type \w+\)": "is neither true nor false",
     r"Invalid type assigned: .*Ramp.*": "a schedule is set by NAME.to=, NAME.begin= and NAME.end=",
 }
-"""Patterns of the libraries' messages, and the words to print instead."""
 TEXTS = (
     "run_dir", "resume", "init_from", "checkpoint", "output", "name", "directory", "runs", "commit", "agent", "actor",
     "track", "evaluation", "run", "against", "beside", "picture", "replay", "report", "betaflight_dump",

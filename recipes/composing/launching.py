@@ -21,6 +21,7 @@ from composing.resolving import tune
 from composing.saved import (
     OBSERVATION_SETTINGS,
     changed_settings,
+    format_value,
     read_yaml,
     restore_saved_settings,
     saved_config,
@@ -42,8 +43,8 @@ from dreamer_racing.training.checkpoint import RunCheckpointError, newest_sound
 from dreamer_racing.training.directory import PREFIX, RunDirectory, env_steps_of, latest_checkpoint, replace_text
 from dreamer_racing.training.session import Session
 
-TRAINED_ON = ("track", "task", "decoys", "init_from", *OBSERVATION_SETTINGS)
-"""Settings that a resumed run cannot change."""
+TRAINED_ON = ("env.suite", "env.from_pixels", "env.preset", "track", "task", "decoys", "init_from")
+"""Settings that a resumed run cannot change, besides `OBSERVATION_SETTINGS`."""
 
 
 def launch(
@@ -83,14 +84,13 @@ def launch(
 def compose_run(config: DictConfig) -> tuple[DictConfig, list[str]]:
     """Return the configuration of a new or resumed run, and the overrides that it is composed from."""
     overrides = given = list(HydraConfig.get().overrides.task)
-    noted = None
     if config.resume:
         config, overrides = resumed_config(config.algorithm, config.resume, overrides)
-        noted = config.track_description
     if config.get("tuned") == "auto":
-        overrides = merge_overrides(overrides, [f"tuned={tune(config)}"])
+        known, overrides = config, merge_overrides(overrides, [f"tuned={tune(config)}"])
         config = hydra.compose(str(HydraConfig.get().job.config_name), overrides)  # --config-name=, if given
-        config.track_description = noted
+        if known.resume:
+            keep_trained_on(config, known, given)
     check_overrides(config, overrides)
     if "loss" in config:
         check_read(config, given)
@@ -98,16 +98,17 @@ def compose_run(config: DictConfig) -> tuple[DictConfig, list[str]]:
 
 
 def check_overrides(config: DictConfig, overrides: Sequence[str]) -> None:
-    """Refuse a task without `env=dmc`, and a track or decoys with it: one of them would be ignored."""
-    given, suite = {override_key(override) for override in overrides}, config.env.suite
+    """Refuse a task without `env=dmc`, and settings of races with it, which would be ignored."""
+    given, suite = {override_key(override): override for override in overrides}, config.env.suite
     if suite == "race" and "task" in given:
         raise ValueError(f"task={config.task} is for the Control Suite: add env=dmc, or leave it out to race.")
-    if suite != "race" and config.decoys:
-        raise ValueError(f"decoys={config.decoys} are for races, and env.suite={suite}: leave them out.")
     if "track_description" in given:
         raise ValueError("track_description= is set by the run from its track file: give track=my_track.yaml.")
-    if suite != "race" and "track" in given:
-        raise ValueError(f"track={config.track} is for races, and env.suite={suite}: leave one of them out.")
+    for name, override in given.items():
+        if suite != "race" and name.partition(".")[0] in ("track", "decoys", "curriculum"):
+            raise ValueError(f"{override} is for races, and env.suite={suite}: leave it out.")
+    if "curriculum.relabel" in given and "replay" not in config:
+        raise ValueError(f"{given['curriculum.relabel']} is for recipes with a replay: leave it out.")
 
 
 def check_read(config: DictConfig, overrides: Sequence[str]) -> None:
@@ -120,26 +121,29 @@ def check_read(config: DictConfig, overrides: Sequence[str]) -> None:
     def have(reader: type[Target]) -> bool:
         return any(issubclass(kind, reader) or not kind.__module__.startswith("dreamer_racing.") for kind in targets)
 
-    images = have(Image) and config.env.from_pixels
-    drift = config.loss.drift_scale == 0 or (config.replay.context and not config.model.sampled)
+    imagines, numbers = config.algorithm == "dreamer_v3", config.loss
+    images, replayed = have(Image) and config.env.from_pixels, numbers.replay_value_scale > 0
+    critic = imagines or replayed  # whether the critic of latents learns
+    drift = numbers.drift_scale == 0 or (config.replay.context and not config.model.sampled)
     flat = [key for key, ramp in config.schedule.items() if isinstance(ramp, DictConfig) and ramp.to is None]
     given = {override_key(override) for override in overrides}
-    for name, read, reader in (
-        ("loss.image_scale", images, "loss=reconstruction or informed, from images"),
-        ("loss.image_share", images, "loss=reconstruction or informed, from images"),
+    for names, read, reader in (
+        ("loss.image_scale loss.image_share", images, "loss=reconstruction or informed, from images"),
         ("loss.privileged_scale", have(State), "loss=privileged or informed"),
         ("loss.barlow_scale", have(Barlow), "loss=decoder_free"),
-        ("model.imagination_starts", config.algorithm == "dreamer_v3", "recipes/dreamer_v3.py, which imagines"),
-        ("model.imagination_every", config.algorithm == "dreamer_v3", "recipes/dreamer_v3.py, which imagines"),
-        ("loss.crash_weight", config.loss.get("continuation", True), "loss.continuation=true"),
+        ("model.imagination_starts model.imagination_every", imagines, "recipes/dreamer_v3.py, which imagines"),
+        ("loss.crash_weight schedule.crash_weight.to", numbers.get("continuation", True), "loss.continuation=true"),
         ("loss.drift_scale", drift, "stored latents (replay.context=true) without sampling (model.sampled=false)"),
+        ("loss.replay_value_gradient", replayed, "loss.replay_value_scale above 0"),
+        ("loss.slow_critic_scale model.behavior_learning_rate", critic, "loss.replay_value_scale above 0"),
+        ("model.slow_critic_rate", critic and numbers.slow_critic_scale > 0, "loss.slow_critic_scale above 0"),
         ("replay.recent_records", config.replay.recent_share > 0, "replay.recent_share above 0"),
-        ("schedule.crash_weight.to", config.loss.get("continuation", True), "loss.continuation=true"),
-        *((f"schedule.{key}.{part}", False, f"schedule.{key}.to") for key in flat for part in ("begin", "end", "by")),
+        *((f"schedule.{key}.begin schedule.{key}.end schedule.{key}.by", False, f"schedule.{key}.to") for key in flat),
         ("schedule.wait_every", config.schedule.get("wait_for_model", 0) is not None, "schedule.wait_for_model"),
     ):
-        if name in given and not read and (value := OmegaConf.select(config, name)) is not None:
-            raise ValueError(f"{name}={value} is for {reader}, which is not chosen: choose that, or leave {name}= out.")
+        for name in names.split() if not read else ():
+            if name in given and (value := OmegaConf.select(config, name)) is not None:
+                raise ValueError(f"{name}={value} is for {reader}, which is not chosen: choose that, or leave it out.")
 
 
 @contextmanager
@@ -224,33 +228,39 @@ def resumed_config(algorithm: str, resume: str, overrides: list[str]) -> tuple[D
     if is_agent(resume) or (not Path(resume).exists() and is_agent(agent_path(resume))):
         raise ValueError(f"resume={resume} is an agent, not a run to resume: start one with init_from={resume}.")
     directory = RunDirectory.of(latest_checkpoint(resume))
-    run_dir = directory.path
     if directory.run != directory:
         raise ValueError(
             f"resume={resume} holds only the networks of a run's best evaluation: set resume={directory.run.path}."
         )
     for file in (directory.config, directory.overrides):
         if not file.exists():
-            raise ValueError(f"{run_dir} cannot be continued: it lacks {file.name}, which every run has.")
-    known = saved_config(run_dir)
+            raise ValueError(f"{directory.path} cannot be continued: it lacks {file.name}, which every run has.")
+    run_dir, known = directory.path, saved_config(directory.path)
     if (trained_by := known.algorithm) != algorithm:
         raise ValueError(f"{run_dir} was trained by {trained_by}: continue it with recipes/{trained_by}.py.")
     for override in overrides:
-        name = override_key(override)
-        if name == "run_dir" and Path(str(override_value(override))).absolute() != run_dir:
+        if override_key(override) == "run_dir" and Path(str(override_value(override))).absolute() != run_dir:
             raise ValueError(f"{override}: a resumed run stays in its own directory, {run_dir}. Leave it out.")
-        if name in TRAINED_ON and override_value(override) != (trained := OmegaConf.select(known, name)):
-            raise ValueError(
-                f"{run_dir} was trained with {name}={trained}, which cannot change: leave {override} out, or start a "
-                "new run."
-            )
     saved = map(str, read_yaml(directory.overrides, ListConfig))
-    kept = {"run_dir": run_dir, **({"env.preset": known.env.preset} if known.env.preset.endswith(SUFFIXES) else {})}
-    merged = merge_overrides(merge_overrides(saved, [as_override(*each) for each in kept.items()]), overrides)
+    merged = merge_overrides(merge_overrides(saved, [as_override("run_dir", run_dir)]), overrides)
     config = hydra.compose(algorithm, merged)
     restore_saved_settings(config, known, {override_key(override) for override in overrides})
-    config.track_description = known.track_description  # even if tuned= or budget= is given
+    keep_trained_on(config, known, overrides)
     return config, merged
+
+
+def keep_trained_on(config: DictConfig, known: DictConfig, overrides: Sequence[str]) -> None:
+    """Set the track and the drone of files to what a run has kept, and refuse what it was not trained on."""
+    config.track_description = known.track_description
+    if config.env.preset.endswith(SUFFIXES) and "env.preset" not in map(override_key, overrides):
+        config.env.preset = known.env.preset
+    for name in (*TRAINED_ON, *OBSERVATION_SETTINGS):
+        trained, now = OmegaConf.select(known, name), OmegaConf.select(config, name)
+        if now != trained:
+            raise ValueError(
+                f"{known.run_dir} was trained with {name}={format_value(trained)}, which cannot change to "
+                f"{format_value(now)}: start a new run, or leave out what sets it."
+            )
 
 
 def is_finished(config: DictConfig) -> bool:

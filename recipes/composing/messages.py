@@ -13,8 +13,7 @@ from types import TracebackType
 INTERRUPTED = "interrupted"
 HEAD_START = 10.0  # s that other processes leave the first to print an error; longer than torchrun takes to end them
 FOR_HELP = ("dreamer_racing", "gymnasium", "yaml")
-NEEDED = (*FOR_HELP, "hydra", "torch", "mujoco")
-"""Packages that all recipes import; if one is missing, this is not the project's environment."""
+NEEDED = (*FOR_HELP, "hydra", "torch", "mujoco")  # if one is missing, this is not the project's environment
 ROOT = Path(__file__).resolve().parents[2]
 
 

@@ -85,9 +85,6 @@ def names(recipe: str) -> list[str]:
     return list(found)
 
 
-RENAMED = {"loss.ppo.flown": "loss.ppo.steps"}  # earlier names
-
-
 def no_such_setting(name: str, recipe: str) -> str:
     """Return a message that a recipe has no setting of this name, with the one that may be meant."""
     known = names(recipe)
@@ -96,7 +93,7 @@ def no_such_setting(name: str, recipe: str) -> str:
     last = {full.rpartition(".")[2]: full for full in known}
     if takers := [f"recipes/{other}.py" for other in TRAINING if recipe in TRAINING and name in names(other)]:
         return f"{name}: there is no such setting of recipes/{recipe}.py; it is for {' and '.join(takers)}."
-    close = [RENAMED[name]] if RENAMED.get(name) in known else difflib.get_close_matches(name, known, n=1)
+    close = difflib.get_close_matches(name, known, n=1)
     close = close or [last[word] for word in difflib.get_close_matches(name.rpartition(".")[2], last, n=1)]
     meant = f" (did you mean {close[0]}?)" if close else ""
     return f"{name}: there is no such setting of recipes/{recipe}.py{meant}. docs/options.md has them all."

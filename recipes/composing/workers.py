@@ -23,10 +23,8 @@ from dreamer_racing.modules import DreamerPolicy
 DIVIDED = ("env.num_envs", "model.batch_size", "model.imagination_starts")
 DIVIDED_PPO = ("loss.ppo.steps", "loss.ppo.minibatch")
 """Settings that are divided equally among the processes; `DIVIDED_PPO` in latent PPO only."""
-ROUNDED_DOWN = ("replay.capacity", "replay.recent_records")
-"""Settings that are divided too, but may leave a remainder."""
-SEEDS_APART = 1_000_000
-"""Difference between the seeds of two processes; initial weights have the run's seed in all of them."""
+ROUNDED_DOWN = ("replay.capacity", "replay.recent_records")  # divided too, but may leave a remainder
+SEEDS_APART = 1_000_000  # of two processes; initial weights have the run's seed in all of them
 
 
 def share_of(config: WorldModelRunConfig) -> WorldModelRunConfig:

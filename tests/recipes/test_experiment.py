@@ -113,9 +113,10 @@ def test_a_run_with_other_settings_is_not_continued(tmp_path: Path) -> None:
     [
         ("algorithm=tdmpc", "algorithm=tdmpc: must be one of dreamer_v3, latent_ppo, ppo, sac"),
         ("variant=mad", "variant=mad: must be one of"),
+        ("run_dir=runs/x", "run_dir=runs/x is for one run: name a folder for all by directory= and name="),
     ],
 )
-def test_unknown_names_are_refused(override: str, words: str, tmp_path: Path) -> None:
+def test_what_no_run_can_have_is_refused(override: str, words: str, tmp_path: Path) -> None:
     with pytest.raises(ValueError, match=words):
         next_command(tmp_path, override)
 

@@ -19,6 +19,7 @@ from dreamer_racing.envs.tracks import Track, describe_track, load_track
 from dreamer_racing.export.onnx_actor import read_contract
 from dreamer_racing.hil.flyer import trained_track
 from dreamer_racing.modules import Interface
+from dreamer_racing.training.directory import RunDirectory
 from tests.running_recipes import ROOT, TINY, UNDRAWN, completed, compose, recipe_module, refused, run_config
 
 
@@ -172,6 +173,8 @@ def test_a_run_keeps_the_track_of_a_file_that_is_gone(track: Track, tmp_path: Pa
     anew = ["tuned=auto", *short, "total_env_steps=280"]
     again = completed("dreamer_v3", "resume=run", *anew, cwd=tmp_path, before=UNDRAWN)
     assert "has changed since" in again.stdout
+    starts = RunDirectory(directory).read_starts()
+    assert all(f"env.preset={drone}" in start["overrides"] for start in starts), "as given, for `experiment` to compare"
     completed("evaluate", "checkpoint=run", f"track={file}", *EVALUATION, cwd=tmp_path, before=UNDRAWN)
     export = ("export", f"checkpoint={directory}", "agent=mine", "commit=abc1234")
     assert "was flown on another track, or" in refused(*export, cwd=tmp_path)

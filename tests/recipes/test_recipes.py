@@ -109,10 +109,15 @@ def test_a_resumed_run_cannot_change_its_track(run_dir: Path) -> None:
     assert (run_dir / "config.yaml").read_text() == before
     training = recipe_module("composing.launching")
     for override, there in (
-        ("+decoys=paper", "decoys=None"), ("env.camera_tilt=10", "env.camera_tilt=25"),
-        ("init_from=kidney", "init_from=None"), ("env.control_rate=25", "env.control_rate=50.0"),
+        ("+decoys=paper", "decoys=null"), ("env.camera_tilt=10", "env.camera_tilt=25"), ("env=dmc", "env.suite=race"),
+        ("init_from=kidney", "init_from=null"), ("env.control_rate=25", "env.control_rate=50.0"),
+        ("env.preset=faithful", "env.preset=easy"), ("env=betaflight", "env.preset=easy"),
+        ("tuned=race", "env.control_rate=50.0"),
     ):  # fmt: skip
-        with pytest.raises(ValueError, match=f"trained with {there}.*, which cannot change"):
+        with (
+            pytest.raises(ValueError, match=f"trained with {there}.*, which cannot change"),
+            hydra.initialize_config_dir(str(CONFIG), version_base="1.3"),
+        ):
             training.resumed_config("dreamer_v3", str(run_dir), [override])
     with pytest.raises(ValueError, match="was trained by dreamer_v3: continue it with recipes/dreamer_v3.py."):
         training.resumed_config("latent_ppo", str(run_dir), [])
@@ -263,7 +268,7 @@ def test_a_run_goes_on_with_its_settings_whatever_today_s_are(run_dir: Path, tmp
     config = composed("model.replay_ratio=5", "loss=decoder_free", "schedule.discount.to=0.99")
     assert (config.model.replay_ratio, config.loss.discount, config.env.num_envs) == (5.0, 0.997, 2)
     assert config.loss.world_model == "decoder_free" and config.schedule.discount.to == 0.99
-    assert composed("tuned=race").loss.world_model == "privileged"
+    assert composed("tuned=race", "env.control_rate=50").loss.world_model == "privileged"
 
 
 def test_a_kill_while_a_run_is_continued_leaves_its_configuration_whole(

@@ -39,7 +39,6 @@ REFUSED = [
         ["loss.critic=latent", "loss.actor=reinforce"],
         ["loss.actor=reinforce learns from imagined steps: use it with recipes/dreamer_v3.py"],
     ),
-    (["loss.actor=flown_ppo"], ["'flown_ppo' was removed", "use recipes/latent_ppo.py"]),
     (["model.replay_ratio=inf"], ["model.replay_ratio=inf", "above 0, and finite"]),
     (["prefill=100", "env.num_envs=8"], ["prefill=100", "12 records", "batch_length=16", "at least 128"]),
     (["prefill=4000", "total_env_steps=4000"], ["total_env_steps=4000", "above prefill=4000"]),
@@ -68,7 +67,6 @@ REFUSED = [
     (["replay.device=gpu"], ["replay.device=gpu: there are auto, cpu, cuda and cuda:1 ... (did you mean cuda?)"]),
     (["schedule.learning_rates.to=0"], ["schedule.learning_rates.to=0.0: must be above 0"]),
     (["schedule.start_on_line.to=0.3"], ["schedule.start_on_line starts from env.start_on_line=0"]),
-    (["loss.actor=asymmetric_ppo"], ["'asymmetric_ppo' was removed: use recipes/latent_ppo.py loss.critic=state."]),
     (["tuned=images", "env.from_pixels=false"], ["tuned=images is for agents that see images", "leave one out"]),
     (["env=dmc", "loss.critic=state"], ["loss.critic=state: read", "loss.critic=latent"]),
     (["schedule.imagination_horizon.to=0"], ["schedule.imagination_horizon.to=0.0: must be at least 1"]),
@@ -135,7 +133,8 @@ def test_more_minibatches_than_records_are_refused() -> None:
     [
         (["task=walker_walk"], "task=walker_walk is for the Control Suite: add env=dmc"),
         (["env=dmc", "track=circle"], "track=circle is for races"),
-        (["env=dmc", "+decoys=paper"], "decoys=paper are for races"),
+        (["env=dmc", "+decoys=paper"], "decoys=paper is for races"),
+        (["env=dmc", "curriculum.maximum=0.02"], "curriculum.maximum=0.02 is for races"),
         (["track_description=x"], "track_description= is set by the run from its track file"),
     ],
 )
@@ -156,6 +155,15 @@ def test_what_would_be_ignored_is_refused(overrides: list[str], words: str) -> N
         (["loss.critic=state", "model.imagination_starts=8"], "imagination_starts=8 is for recipes/dreamer_v3.py, whi"),
         (["loss.drift_scale=1", "replay.context=true"], "drift_scale=1.* is for stored latents .*model.sampled=false"),
         (["loss.drift_scale=1", "model.sampled=false"], "drift_scale=1.* is for stored latents .replay.context=true"),
+        (
+            ["loss.replay_value_scale=0", "loss.replay_value_gradient=false"],
+            "gradient=False is for loss.replay_value_sc",
+        ),
+        (["loss.slow_critic_scale=0", "model.slow_critic_rate=0.1"], "slow_critic_rate=0.1 is for loss.slow_critic_sc"),
+        (
+            ["loss.critic=state", "loss.replay_value_scale=0", "model.behavior_learning_rate=1e-4"],
+            "behavior_learning_rate=0.0001 is for loss.replay_value_scale above 0",
+        ),
         (["replay.recent_records=9"], "replay.recent_records=9 is for replay.recent_share above 0"),
         (["loss.continuation=false", "loss.crash_weight=4"], "crash_weight=4.* is for loss.continuation=true, which"),
         (
