@@ -28,6 +28,7 @@ from dreamer_racing.export.weights_file import write_weights
 from dreamer_racing.modules import join_features
 from dreamer_racing.modules.agent import Agent
 from dreamer_racing.modules.interface import IMU, PIXELS, VECTOR
+from dreamer_racing.modules.layers import use_few_kernels
 from dreamer_racing.modules.rssm import mix_uniform
 from dreamer_racing.settings import check_choice
 from dreamer_racing.training.directory import ensure_writable
@@ -66,9 +67,10 @@ class ActorStep(nn.Module):
         self.encoder = copy.deepcopy(agent.world_model.encoder)
         self.rssm = copy.deepcopy(agent.world_model.rssm)
         self.actor = copy.deepcopy(agent.actor)
+        self.cpu()
+        use_few_kernels(self, on=False)
         for parameter in self.parameters():
-            # torch.export cannot save channels-last weights.
-            parameter.data = parameter.data.cpu().contiguous()
+            parameter.data = parameter.data.contiguous()  # torch.export cannot save channels-last weights
         self.requires_grad_(False)
 
     def forward(

@@ -187,7 +187,8 @@ class BaselinePolicy(TensorDictModuleBase):
 def layers_of(size: NetworkSize, interface: Interface) -> dict[str, Any]:
     """Return the description of networks that a checkpoint keeps: their hidden layers and their inputs."""
     image_size = interface.image_size if interface.pixels else None
-    return {**asdict(size), "image_size": image_size, "imu": interface.vector_key == IMU}
+    widths = {"numbers": interface.vector_dim, "actions": interface.action_dim}
+    return {**asdict(size), "image_size": image_size, "imu": interface.vector_key == IMU, **widths}
 
 
 def check_layers(saved: dict[str, Any], present: dict[str, Any]) -> None:
@@ -202,7 +203,7 @@ def check_layers(saved: dict[str, Any], present: dict[str, Any]) -> None:
             f"The checkpoint's networks were made with env.from_pixels={there}, this learner's with {here}: set "
             f"env.from_pixels={there}, or start a new run."
         )
-    if (there := saved.get("imu", False)) is not present["imu"]:  # earlier ones had no IMU
+    if (there := saved["imu"]) is not present["imu"]:
         raise ValueError(
             f"The checkpoint's networks were made {'with' if there else 'without'} env.imu, and this learner's are "
             f"made {'without' if there else 'with'} it: set it as it was, or start a new run."
@@ -212,6 +213,12 @@ def check_layers(saved: dict[str, Any], present: dict[str, Any]) -> None:
             raise ValueError(
                 f"The checkpoint's networks were made with {setting}={saved[key]}, this learner's with {present[key]}: "
                 f"set {setting}={saved[key]}, or start a new run."
+            )
+    for key, what in (("numbers", "observed numbers, as of env.vector"), ("actions", "actions")):
+        if (there := saved.get(key, present[key])) != present[key]:
+            raise ValueError(
+                f"The checkpoint's networks were made for {there} {what}, this learner's for {present[key]}: set it as "
+                "it was, or start a new run."
             )
 
 
@@ -273,7 +280,11 @@ class BaselineLearner(ABC):
     def _gradient_step(
         self, loss: Tensor, metrics: dict[str, Tensor], batch: TensorDictBase, clip: float | None = None
     ) -> dict[str, Tensor]:
-        """Make a gradient step unless something is not finite, each network's norm clipped; return all metrics."""
+        """Make a gradient step, each network's norm clipped, and return all metrics.
+
+        Raises:
+            NonFiniteLossError: If something is not finite: on a CPU before the step, on a CUDA device two checks later.
+        """
         self.optimizer.zero_grad(set_to_none=True)
         loss.backward()
         norms = gradient_norms(self.networks)

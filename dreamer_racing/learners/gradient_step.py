@@ -22,6 +22,19 @@ def gradient_norms(networks: Mapping[str, list[nn.Parameter]]) -> dict[str, Tens
     return {f"gradient_norm/{name}": nn.utils.get_total_norm(found) for name, found in gradients.items() if found}
 
 
+def check_scalars(values: Mapping[str, Tensor]) -> None:
+    """Refuse losses and metrics that are not scalar tensors, as those of one's own may be.
+
+    Raises:
+        ValueError: The message names them.
+    """
+    bad = {name: value for name, value in values.items() if not (isinstance(value, Tensor) and value.dim() == 0)}
+    if bad:
+        kinds = {name: tuple(each.shape) if isinstance(each, Tensor) else type(each) for name, each in bad.items()}
+        found = ", ".join(f"{name} is {'of shape ' * isinstance(kind, tuple)}{kind}" for name, kind in kinds.items())
+        raise ValueError(f"Losses and metrics must be scalar tensors: {found}. Take the mean, or use torch.tensor().")
+
+
 def restore(optimizer: torch.optim.Optimizer, state: dict[str, Any]) -> None:
     """Restore an optimiser's state, but keep its own settings: a run may resume with other rates or another device."""
     saved = {index: group for group in state["param_groups"] for index in group["params"]}

@@ -27,7 +27,7 @@ from torch import Tensor, nn
 from dreamer_racing import parallel
 from dreamer_racing.experience.rollouts import RolloutStorage
 from dreamer_racing.learners.config import LearnerConfig
-from dreamer_racing.learners.gradient_step import restore
+from dreamer_racing.learners.gradient_step import check_scalars, restore
 from dreamer_racing.learners.learner import Timer, untimed
 from dreamer_racing.learners.update import WorldModelLearner
 from dreamer_racing.losses import LatentPPOLosses, Trajectory, find_objective, normalized, rollout_return
@@ -173,8 +173,7 @@ class LatentPPO(WorldModelLearner):
             # Actor: epochs of the objective, until the divergence from the policy before this update is too large. It
             # is not measured from the policy that acted, because a bound on the standard deviation that was lowered
             # since then would count as divergence and end the epochs.
-            weight = torch.ones_like(targets)
-            advantage = normalized(targets - value.flatten(0, 1), weight).clamp(-ppo.advantage_clip, ppo.advantage_clip)
+            advantage = normalized(targets - value.flatten(0, 1)).clamp(-ppo.advantage_clip, ppo.advantage_clip)
             with torch.no_grad():
                 before = torch.cat(self.agent.actor(taken["features"]), -1)  # (M, 2·A)
 
@@ -189,16 +188,15 @@ class LatentPPO(WorldModelLearner):
                     lambda_return=targets[chosen],
                     value=value.flatten(0, 1)[chosen],
                     advantage=advantage[chosen],
-                    weight=weight[chosen],
-                    scale=weight.new_ones(()),
+                    weight=targets.new_ones(len(chosen), 1),
+                    scale=targets.new_ones(()),
                 )
                 loss, metrics = self.objective(
                     trajectory, entropy_scale=self.entropy_scale, clip_epsilon=ppo.clip_epsilon
                 )
                 with torch.no_grad():  # over all processes, which must end their epochs together
                     diverged = ActionDistribution(*before[chosen].chunk(2, -1)).divergence(policy)
-                    number = parallel.total(trajectory.weight.sum()).clamp_min(1e-8)
-                    kl = parallel.total((trajectory.weight * diverged).sum()) / number
+                    kl = parallel.total(diverged.sum()) / parallel.total(trajectory.weight.sum())
                 return loss, {**metrics, "ppo/kl": kl}
 
             moved = self.actor_update.run(len(taken), actor_loss)
@@ -351,6 +349,7 @@ class PPOUpdate:
 
     def _step(self, loss: Tensor, metrics: dict[str, Tensor], active: Tensor) -> dict[str, Tensor]:
         """Make one gradient step if ``active`` (a bool scalar) and if the gradient is finite."""
+        check_scalars({"loss": loss, **metrics})
         self.optimizer.zero_grad(set_to_none=True)
         loss.backward()
         if parallel.num_processes() > 1:

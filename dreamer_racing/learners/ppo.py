@@ -20,7 +20,7 @@ from dreamer_racing.learners.baseline import BaselineLearner, NetworkModule, Net
 from dreamer_racing.learners.learner import Timer, ValueFunction, seeded, untimed
 from dreamer_racing.modules import Interface
 from dreamer_racing.modules.heads import clipped_mean
-from dreamer_racing.settings import COUNT, NOT_NEGATIVE, POSITIVE, SHARE, setting
+from dreamer_racing.settings import COUNT, NOT_NEGATIVE, POSITIVE, SHARE, check_settings, setting
 
 
 @dataclass
@@ -95,6 +95,7 @@ class PPOLearner(BaselineLearner):
     ) -> None:
         super().__init__(size, interface, device)
         self.config = config or PPOConfig()
+        check_settings(self.config)
         with seeded(seed):  # the actor's mean depends on the observation, its standard deviation does not
             network = ObservationNetwork(interface, interface.action_dim, size, output_scale=0.01)
             deviation = AddStateIndependentNormalScale(

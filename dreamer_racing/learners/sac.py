@@ -17,7 +17,7 @@ from torchrl.objectives import SACLoss, SoftUpdate
 from dreamer_racing.learners.baseline import BaselineLearner, NetworkModule, NetworkSize, ObservationNetwork, make_actor
 from dreamer_racing.learners.learner import Timer, seeded, untimed
 from dreamer_racing.modules import Interface
-from dreamer_racing.settings import COUNT, POSITIVE, SHARE, setting
+from dreamer_racing.settings import COUNT, POSITIVE, SHARE, check_settings, setting
 
 NO_WEIGHT = 1e-30  # negligible beside a transition's weight of 1, but a sum of such weights is not 0
 
@@ -74,6 +74,7 @@ class SACLearner(BaselineLearner):
     ) -> None:
         super().__init__(size, interface, device)
         self.config = config or SACConfig()
+        check_settings(self.config)
         with seeded(seed):  # mean and standard deviation depend on the observation; tanh squashes into [−1, 1]
             network = ObservationNetwork(interface, 2 * interface.action_dim, size, output_scale=0.01)
             self.actor = make_actor(network, NormalParamExtractor(), TanhNormal).to(self.device)

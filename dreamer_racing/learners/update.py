@@ -21,6 +21,7 @@ from dreamer_racing.learners.config import LearnerConfig
 from dreamer_racing.learners.gradient_step import (
     FiniteGuard,
     GraphedStep,
+    check_scalars,
     gradient_norms,
     restore,
     step_with_gradients,
@@ -66,6 +67,8 @@ class WorldModelLearner(ABC):
         self.config = config or LearnerConfig()
         check_settings(self.loss_config)
         check_settings(self.config)
+        if self.loss_config.min_std > self.loss_config.max_std:
+            raise ValueError(f"min_std={self.loss_config.min_std} is above max_std={self.loss_config.max_std}.")
         self.agent = agent
         self.device = next(agent.parameters()).device
         self.world_model_loss = WorldModelLoss(agent, self.loss_config).to(self.device)
@@ -131,7 +134,8 @@ class WorldModelLearner(ABC):
                 ``terminated``, ``truncated``, scalars ``(B, T, 1)``; optionally ``context``, the stored latents, from
                 which windows then start, and which ``drift_scale`` requires.
             timed: Makes a context manager that times an activity: ``world_model``, ``imagine`` (actor and critic, even
-                if nothing is imagined), ``optimise``, ``improve``. The split is only meaningful on a CPU.
+                if nothing is imagined), ``optimise``, ``exchange`` (between processes), ``improve``. The split is only
+                meaningful on a CPU.
 
         Returns:
             Scalar tensors on the device: all losses and metrics that were computed, ``gradient_norm/<network>`` (before
@@ -255,6 +259,8 @@ class WorldModelLearner(ABC):
     def gradient_step(self, batch: TensorDictBase, timed: Timer) -> dict[str, Tensor]:
         """Make one gradient step on a batch ``[B, T]``; return its losses and metrics as `update` does."""
         batch = batch.to(self.device, non_blocking=True)
+        if not self.config.cuda_graph:  # here, so that gradients of a refused batch do not remain
+            self.optimizer.zero_grad(set_to_none=True)
         metrics = self._backward(batch, timed) if self._graph is None else self._graph(batch)
         if parallel.num_processes() > 1:
             # One all-reduce of a flat tensor, outside of the captured graph, instead of `DistributedDataParallel`: one
@@ -267,8 +273,6 @@ class WorldModelLearner(ABC):
         with timed("optimise"):
             step_with_gradients(self.optimizer)
             self.agent.critic.update_slow(self.config.slow_critic_rate)
-            if not self.config.cuda_graph:
-                self.optimizer.zero_grad(set_to_none=True)
         self.updates += 1
         return metrics
 
@@ -277,10 +281,8 @@ class WorldModelLearner(ABC):
         cast_weights = cast_once(self.modules, torch.bfloat16) if self._casts_once else nullcontext()
         with self.autocast(), cast_weights:
             metrics = self.compute_losses(batch, timed)
-        losses = {key: value for key, value in metrics.items() if key.startswith("loss_")}
-        if shapes := {key: tuple(value.shape) for key, value in losses.items() if value.dim()}:
-            raise ValueError(f"losses must be scalars, and these have shapes: {shapes}; take their means.")
-        total = torch.stack(list(losses.values())).sum()
+        check_scalars(metrics)
+        total = torch.stack([value for key, value in metrics.items() if key.startswith("loss_")]).sum()
         with timed("optimise"):
             total.backward()
             norms = gradient_norms(self._trained)

@@ -53,7 +53,8 @@ class Trajectory:
         advantage: λ-return minus value, ``(H, N, 1)``: divided by ``scale`` for imagined steps, normalised to mean 0
             and standard deviation 1 for collected ones.
         weight: Weight of each step, ``(H, N, 1)``: 1 if collected; if imagined the product of the discounts before
-            it, each γ times the probability that the episode continues to the power of ``crash_weight``.
+            it, each γ times the probability that the episode continues to the power of ``crash_weight``; 0 if the
+            rollout starts from a record that ended its episode.
         scale: Range of the returns, at least 1, a scalar.
     """
 
@@ -69,7 +70,16 @@ class Trajectory:
     scale: Tensor
 
     def mean(self, values: Tensor) -> Tensor:
-        """Return the mean of ``weight`` times values ``(H, N, 1)`` over the steps, a scalar."""
+        """Return the mean of ``weight`` times values ``(H, N, 1)`` over the steps, a scalar.
+
+        Raises:
+            ValueError: If the values have another shape, which would be broadcast.
+        """
+        if values.shape != self.weight.shape:
+            raise ValueError(
+                f"Trajectory.mean() of values of shape {tuple(values.shape)}: must be {tuple(self.weight.shape)}, one "
+                "value for each step; sum over actions by .sum(-1, keepdim=True)."
+            )
         return (self.weight * values).mean()
 
     def action_change(self) -> Tensor:
@@ -169,9 +179,9 @@ def policy_drift(actor: nn.Module, before: Tensor, after: Tensor, weight: Tensor
     return (weight * drift).mean()
 
 
-def normalized(advantage: Tensor, weight: Tensor) -> Tensor:
-    """Normalise advantages ``(..., 1)`` to weighted mean 0 and standard deviation 1 over all processes."""
-    share = weight / parallel.total(weight.sum()).clamp_min(1e-8)
+def normalized(advantage: Tensor) -> Tensor:
+    """Normalise advantages ``(..., 1)`` to mean 0 and standard deviation 1 over all processes."""
+    share = 1.0 / parallel.total(advantage.new_full((), float(advantage.numel())))
     mean = parallel.total((share * advantage).sum())
     deviation = parallel.total((share * (advantage - mean).square()).sum()).sqrt()
     return (advantage - mean) / (deviation + 1e-8)
@@ -192,14 +202,6 @@ OBJECTIVES: dict[str, Objective] = {"reinforce": reinforce, "dynamics": dynamics
 ON_POLICY = ("clipped",)
 """Objectives of collected steps; the others are of imagined steps."""
 
-REMOVED = {
-    "ppo": "use recipes/latent_ppo.py, where PPO learns from collected steps",
-    "flown_ppo": "use recipes/latent_ppo.py, where the critic learns from collected steps, too",
-    "latent_ppo": "use recipes/latent_ppo.py loss.critic=latent",
-    "asymmetric_ppo": "use recipes/latent_ppo.py loss.critic=state",
-}
-"""Earlier names, and what replaces them."""
-
 
 def find_objective(name: str, collected: bool | None = None) -> Objective:
     """Return an objective by its name, or import your own, given as ``module:function``.
@@ -215,9 +217,9 @@ def find_objective(name: str, collected: bool | None = None) -> Objective:
         found = import_own(name, f"Objective {name!r}")
         if not callable(found):
             raise ValueError(f"Objective {name!r} is not a function of a Trajectory.")
+        if collected and getattr(found, "through_dynamics", False):
+            raise ValueError(f"loss.actor={name} needs imagination's gradient: use it with recipes/dreamer_v3.py.")
         return found
-    if name in REMOVED:
-        raise ValueError(f"The actor {name!r} was removed: {REMOVED[name]}.")
     if name not in OBJECTIVES:
         raise ValueError(
             f"Unknown objective {name!r}{suggestion(name, OBJECTIVES)}. Known objectives: {', '.join(OBJECTIVES)}. "

@@ -134,8 +134,8 @@ def replay_critic_loss(
     logits = critic(features)
     if bootstrap is None:
         bootstrap = critic.two_hot.decode(logits.detach())
-    is_init, terminated, truncated = (batch.get(name) for name in ("is_init", "terminated", "truncated"))
-    returns, weight = replay_return(batch.get("reward"), bootstrap, is_init, terminated, truncated, discount, lambda_)
+    is_init, terminated, truncated = (batch[name] for name in ("is_init", "terminated", "truncated"))
+    returns, weight = replay_return(batch["reward"], bootstrap, is_init, terminated, truncated, discount, lambda_)
     return (weight * _regression(critic, features, logits, returns, slow_scale)).mean()
 
 

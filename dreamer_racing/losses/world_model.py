@@ -27,6 +27,11 @@ from dreamer_racing.settings import import_own, suggestion
 
 OPEN_LOOP_STARTS = 64
 """N, records of a batch from which `open_loop_loss` predicts; this project's choice, which limits its time."""
+RESERVED = (
+    "loss", "loss_reward", "loss_continue", "reward_error", "loss_dynamics", "loss_representation", "kl", "loss_drift",
+    "policy_drift", "loss_replay_critic", "loss_open_loop", "loss_actor", "loss_critic",
+)  # fmt: skip
+"""Names of losses and metrics that targets cannot have."""
 
 
 class Latents(NamedTuple):
@@ -61,7 +66,7 @@ class WorldModelLoss(nn.Module):
         targets: Targets by the names of their classes.
 
     Raises:
-        ValueError: If a target is unknown, or lacks something that it needs.
+        ValueError: If a target is unknown, lacks something that it needs, or has the class name of another one.
 
     Reference: DreamerV3, Eq. 4-5.
     """
@@ -72,6 +77,8 @@ class WorldModelLoss(nn.Module):
         self.config = config
         kinds = find_targets(config.world_model)
         self.targets = nn.ModuleDict({kind.__name__: kind(agent, config) for kind in kinds})
+        if len(self.targets) < len(kinds):
+            raise ValueError(f"loss.world_model={config.world_model}: two targets have one class name; rename yours.")
         decoders = (agent.world_model.decoder, agent.world_model.vector_decoder)
         if any(kind.decodes for kind in kinds) and not any(decoders):
             raise ValueError(f"loss {config.world_model!r} needs a world model with decoders: Agent(..., decode=True).")
@@ -93,6 +100,7 @@ class WorldModelLoss(nn.Module):
 
         Raises:
             KeyError: If the batch lacks a key.
+            ValueError: If a target returns a name that is taken.
         """
         if missing := [key for key in self.in_keys if batch.get(key, None) is None]:
             found = ", ".join(sorted(map(str, batch.keys())))
@@ -108,8 +116,11 @@ class WorldModelLoss(nn.Module):
 
         # Targets: what the latents must encode besides rewards.
         losses: dict[str, Tensor] = {}
-        for target in self.targets.values():
-            losses |= target(posterior, features, embedding, batch)
+        for name, target in self.targets.items():
+            found = target(posterior, features, embedding, batch)
+            if taken := sorted(found.keys() & {*losses, *RESERVED}):
+                raise ValueError(f"Target {name} returns {', '.join(taken)}, which another loss has: rename it.")
+            losses |= found
 
         # Rewards received on arriving at each record, and whether the episode continues there.
         reward, goes_on, head = batch.get("reward"), 1.0 - batch.get("terminated").float(), model.reward_head

@@ -365,11 +365,11 @@ LAYERS = (nn.Linear, nn.Conv2d, nn.ConvTranspose2d, BlockLinear, LayerNorm, RMSN
 """Layers whose weights, biases and gains are cast; all other parameters stay in float32."""
 
 
-def use_few_kernels(module: nn.Module) -> None:
-    """Turn on ``few_kernels`` in all submodules that have it."""
+def use_few_kernels(module: nn.Module, on: bool = True) -> None:
+    """Turn ``few_kernels`` on or off in all submodules that have it."""
     for part in module.modules():
         if hasattr(part, "few_kernels"):
-            part.few_kernels = True  # type: ignore[assignment]  # no tensor, nor a module
+            part.few_kernels = on  # type: ignore[assignment]  # no tensor, nor a module
 
 
 @contextmanager

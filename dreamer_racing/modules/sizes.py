@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 
-from dreamer_racing.settings import check_choice
+from dreamer_racing.settings import COUNT, check_choice, check_setting
 
 
 @dataclass(frozen=True)
@@ -61,6 +61,23 @@ class ModelSize:
     bins: int = 255
     sampled: bool = True
     state_std: bool = True
+
+    def __post_init__(self) -> None:
+        """Refuse sizes of which no sound networks can be made.
+
+        Raises:
+            ValueError: The message names the field.
+        """
+        check_choice("norm", self.norm, ("rms", "layer"))
+        check_choice("recurrence", self.recurrence, ("block", "dense"))
+        for name in ("blocks", "prior_layers", "head_layers", "actor_critic_layers", "vector_layers"):
+            check_setting(name, getattr(self, name), COUNT, whole=True)
+        channels = self.cnn_depth * self.cnn_multipliers[-1]
+        for name, width in (("belief", self.belief), ("cnn_depth times the last of cnn_multipliers", channels)):
+            if width % self.blocks:
+                raise ValueError(f"{name}={width}: must be a multiple of blocks={self.blocks}.")
+        if self.classes > 256:
+            raise ValueError(f"classes={self.classes}: at most 256, as the replay stores a class in a byte.")
 
     @property
     def state(self) -> int:

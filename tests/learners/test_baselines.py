@@ -5,6 +5,7 @@ from __future__ import annotations
 import copy
 import math
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Any
 
 import pytest
@@ -133,13 +134,30 @@ def test_networks_of_another_size_are_refused(kind: type[PPOLearner | SACLearner
         (NUMBERS, Interface(), "env.from_pixels=false, this learner's with true: set env.from_pixels=false"),
         (Interface(), SEES_IMU, "made without env.imu, and this learner's are made with it"),
         (SEES_IMU, Interface(), "made with env.imu, and this learner's are made without it"),
+        (
+            NUMBERS,
+            replace(NUMBERS, vector_dim=9),
+            rf"made for {NUMBERS.vector_dim} observed numbers, .* learner's for 9",
+        ),
     ],
-    ids=["size", "no images", "no imu", "imu"],
+    ids=["size", "no images", "no imu", "imu", "numbers"],
 )
 def test_networks_of_other_observations_are_refused(there: Interface, here: Interface, words: str) -> None:
     saved = PPOLearner(SMALL, there, seed=0).state_dict()
     with pytest.raises(ValueError, match=words):
         PPOLearner(SMALL, here, seed=0).load_state_dict(saved)
+
+
+@pytest.mark.parametrize(
+    ("make", "words"),
+    [
+        (lambda: PPOLearner(SMALL, NUMBERS, PPOConfig(epochs=0)), "epochs=0: must be at least 1"),
+        (lambda: SACLearner(SMALL, NUMBERS, SACConfig(initial_alpha=0.0)), "initial_alpha=0.0: must be above 0"),
+    ],
+)
+def test_settings_out_of_range_are_refused(make: Callable[[], object], words: str) -> None:
+    with pytest.raises(ValueError, match=words):
+        make()
 
 
 @pytest.mark.parametrize(("minibatches", "steps"), [(1, 1), (7, 7), (48, 48)])

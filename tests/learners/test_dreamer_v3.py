@@ -282,6 +282,9 @@ def test_what_would_spoil_the_networks_is_refused(spoil):
     assert error.value.batch["reward"].shape == (3, 6, 1)
     assert learner.updates == 0
     assert not differing(learner.agent.state_dict(), before)
+    if spoil is not spoil_gradient:  # which stays spoilt
+        learner.update(make_batch())
+        assert learner.updates == 1 and differing(learner.agent.state_dict(), before)
 
 
 @pytest.mark.parametrize(
@@ -456,16 +459,16 @@ def test_a_target_s_own_network_is_saved_under_whatever_name(monkeypatch):
 
 
 class NoScalar(Target):
-    """Forgets to take the mean."""
+    """Forgets to take the mean, and that metrics are tensors."""
 
     def forward(self, posterior, features, embedding, batch):
-        return {"loss_mine": torch.zeros(2, 3)}
+        return {"loss_mine": torch.zeros(2, 3), "my_weight": 0.3}
 
 
-def test_a_loss_that_is_no_scalar_is_refused_by_name(monkeypatch):
+def test_losses_and_metrics_that_are_no_scalar_tensors_are_refused_by_name(monkeypatch):
     monkeypatch.setitem(TARGETS, "own", (NoScalar,))
     learner = learner_of(seed=0, **CONFIG | {"world_model": "own"})
-    with pytest.raises(ValueError, match=r"losses must be scalars, .*'loss_mine': \(2, 3\)"):
+    with pytest.raises(ValueError, match=r"scalar tensors: loss_mine is of shape \(2, 3\), my_weight is .*float"):
         learner.update(make_batch())
 
 

@@ -137,12 +137,16 @@ def test_the_probability_of_a_clipped_action_has_a_gradient_far_beyond_the_bound
     assert mean.grad.isfinite().all() and mean.grad.item() > 0
 
 
-def test_normalized_advantages_have_mean_zero_and_deviation_one_under_their_weights():
-    advantage, weight = torch.randn(50, 1) * 7 + 3, torch.rand(50, 1)
-    found = normalized(advantage, weight)
-    share = weight / weight.sum()
-    assert (share * found).sum().item() == pytest.approx(0.0, abs=1e-5)
-    assert (share * found.square()).sum().item() == pytest.approx(1.0, rel=1e-4)
+def test_normalized_advantages_have_mean_zero_and_deviation_one():
+    found = normalized(torch.randn(50, 1) * 7 + 3)
+    assert found.mean().item() == pytest.approx(0.0, abs=1e-5)
+    assert found.square().mean().item() == pytest.approx(1.0, rel=1e-4)
+
+
+def test_a_mean_of_anything_but_a_number_for_each_step_is_refused():
+    trajectory = make_trajectory()
+    with pytest.raises(ValueError, match=rf"values of shape \({H}, {N}\): must be \({H}, {N}, 1\).*keepdim=True"):
+        trajectory.mean(trajectory.advantage.squeeze(-1))
 
 
 def test_drift_is_the_divergence_of_the_two_policies_and_trains_the_latents_alone():
@@ -165,9 +169,15 @@ def test_an_objective_is_found_by_its_name_or_in_a_module_of_ones_own(tmp_path, 
     assert find_objective("reinforce") is reinforce and set(OBJECTIVES) == {"reinforce", "dynamics", "clipped"}
     with pytest.raises(ValueError, match=r"Unknown objective 'reinforced' \(did you mean reinforce\?\).*: reinforce"):
         find_objective("reinforced")
-    (tmp_path / "my_objectives.py").write_text("from dreamer_racing.losses import reinforce as mine\nother = 3\n")
+    (tmp_path / "my_objectives.py").write_text(
+        "from dreamer_racing.losses import dynamics, reinforce as mine\nother = 3\n"
+    )
     monkeypatch.chdir(tmp_path)  # not on PYTHONPATH: the folder that one starts from is enough
     assert find_objective("my_objectives:mine") is reinforce
+    with pytest.raises(
+        ValueError, match=r"loss.actor=my_objectives:dynamics needs imagination's gradient: .*dreamer_v3"
+    ):
+        find_objective("my_objectives:dynamics", collected=True)
     with pytest.raises(ValueError, match="module 'my_objectives' has no 'missing'"):
         find_objective("my_objectives:missing")
     with pytest.raises(ValueError, match="'my_objectives:other' is not a function of a Trajectory"):

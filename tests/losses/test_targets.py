@@ -268,6 +268,34 @@ def test_what_a_target_lacks_is_an_error_that_says_what_to_do():
         WorldModelLoss(agent, LossConfig())
 
 
+class Image2(Image):
+    """Has the names of `Image`."""
+
+
+Named = type("Image", (Image,), {})
+"""Is called as `Image` is."""
+
+
+class Total(Target):
+    """Has the name of a loss that the learner adds."""
+
+    def forward(self, posterior, features, embedding, batch):
+        return {"loss_actor": features.sum()}
+
+
+@pytest.mark.parametrize(("own", "name"), [(Image2, "loss_image"), (Total, "loss_actor")])
+def test_a_target_whose_losses_have_taken_names_is_refused(own, name, monkeypatch):
+    monkeypatch.setitem(TARGETS, "own", (Image, own))
+    with pytest.raises(ValueError, match=f"Target {own.__name__} returns .*{name}.*, which another loss has"):
+        make_loss("own")(make_batch())
+
+
+def test_two_targets_of_one_class_name_are_refused(monkeypatch):
+    monkeypatch.setitem(TARGETS, "own", (Image, Named))
+    with pytest.raises(ValueError, match="loss.world_model=own: two targets have one class name"):
+        make_loss("own")
+
+
 @pytest.mark.parametrize("name", ADDED)
 def test_only_losses_that_decode_have_decoders(name):
     world_model = learner_of("debug", SIGHTS["both"], world_model=name).agent.world_model

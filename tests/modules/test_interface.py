@@ -247,6 +247,21 @@ def test_sizes_have_their_number_of_parameters(name):
     assert get_size(name) is SIZES[name]
 
 
+@pytest.mark.parametrize(
+    ("size", "changed", "words"),
+    [
+        ("size1m", {"cnn_depth": 3}, "cnn_depth times the last of cnn_multipliers=12: must be a multiple of blocks=8"),
+        ("size1m", {"belief": 100}, "belief=100: must be a multiple of blocks=8"),
+        ("debug", {"classes": 300}, "classes=300: at most 256"),
+        ("debug", {"norm": "batch"}, "norm=batch: must be one of rms, layer"),
+        ("debug", {"prior_layers": 0}, "prior_layers=0: must be at least 1"),
+    ],
+)
+def test_sizes_of_which_no_sound_networks_can_be_made_are_refused(size, changed, words):
+    with pytest.raises(ValueError, match=words):
+        replace(SIZES[size], **changed)
+
+
 def test_unknown_size_lists_the_known_ones():
     with pytest.raises(ValueError, match="model=huge: must be one of debug, cpu_small.*paper_large"):
         get_size("huge")

@@ -123,7 +123,7 @@ class Quadrotor:
         """Restore what `state_dict` returned."""
         self.rotor_speed.copy_(state_dict["rotor_speed"])
         self.setpoints.copy_(state_dict["setpoints"])
-        for name, values in (state_dict["drones"] or {}).items():  # None in older states of drones that do not vary
+        for name, values in state_dict["drones"].items():
             self.drones[name].copy_(values)
         if self.rate_loop is not None:
             self.rate_loop.state.copy_(state_dict["rate_loop"])
