@@ -24,8 +24,9 @@ class LearnerConfig:
         cuda_graph: Replay forward and backward pass as one CUDA graph. The recipes replace None by whether the run
             supports it; otherwise None means False.
         few_kernels: Launch fewer kernels: cast weights once per update (with ``mixed_precision``), sum the gradients of
-            gains and biases after the loop over T, draw imagination's noise in advance. Rounding and samples differ.
-            None turns it on for CUDA devices, where launching a small kernel takes longer than running it.
+            gains and biases after the loop over T, with ``reinforce`` draw imagination's noise in advance. Rounding and
+            samples differ. None turns it on for CUDA devices, where launching a small kernel takes longer than running
+            it.
         mixed_precision: Compute the losses under bfloat16 autocast; parameters, logits and losses stay float32. The
             recipes replace None by whether the device gains by it; otherwise None means False.
         learning_rate: Learning rate. The reference's 4e-5 suits large models; small ones learn faster at 1e-4 to 3e-4.

@@ -131,7 +131,7 @@ class GraphedStep:
     """Replays a step as one CUDA graph, captured at the first call.
 
     The step must not wait for the device. Gradients live in the graph's memory and are overwritten at every replay:
-    ``.grad`` must be None before the first call, and must not be set to None between calls.
+    ``.grad`` must not be set to None between calls.
 
     Args:
         step: Function to capture.

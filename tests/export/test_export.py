@@ -30,6 +30,7 @@ from dreamer_racing.export.parity import MIN_STEPS, ParityError, RecordedFlight,
 from dreamer_racing.export.shipped_agent import load_agent
 from dreamer_racing.modules import Interface, ModelSize
 from dreamer_racing.modules.agent import Agent
+from dreamer_racing.modules.layers import use_few_kernels
 from dreamer_racing.modules.rssm import mix_uniform
 from tests.export.recorded import make_agent, make_flight
 from tests.running_recipes import ROOT, UNDRAWN, completed, python, recipe
@@ -295,6 +296,14 @@ def check_disturbed(agent: Agent, change: Callable[[list[Tensor]], object], late
 
 def add_to_action(value: float) -> Callable[[list[Tensor]], object]:
     return lambda outputs: outputs[0][0, 1].add_(value)
+
+
+def test_an_export_computes_as_on_a_cpu_whatever_its_learner_was_told(agent: Agent) -> None:
+    told = copy.deepcopy(agent)
+    use_few_kernels(told)
+    modules = list(ActorStep(told).modules())
+    assert any(hasattr(part, "few_kernels") for part in modules)
+    assert not any(getattr(part, "few_kernels", False) for part in modules)
 
 
 def test_the_tolerance_of_actions(agent: Agent) -> None:
