@@ -93,7 +93,7 @@ class EvaluationReport:
         """Write `evaluations/<name>.json`, `plots/<name>.png` and, with images, `videos/<name>.mp4`.
 
         For later figures, also write `evaluations/<name>_trajectory.csv`, with images `<name>_onboard.npz`, and with a
-        world model that predicts images `<name>_dream.npz`.
+        world model that decodes images or the true state `<name>_dream.npz`.
         """
         into = self.directory
         for folder in (into.evaluations, into.plots, into.videos):

@@ -296,6 +296,9 @@ def along(runs: Sequence[RunData], axis: str) -> tuple[list[RunData], list[str]]
             problems.append(f"{run.name} left out: it has no {clock}, which axis={axis} needs")
             continue
         clock_steps, seconds = run.metrics.columns[clock]
+        if clock_steps[-1] < run.metrics.env_steps[-1]:  # resumed where it is not known, on Ray or by several processes
+            problems.append(f"{run.name} left out: its {clock} ends at {clock_steps[-1]:,.0f} env_steps")
+            continue
         hours: Callable[..., Any] = partial(np.interp, xp=clock_steps, fp=seconds / 3600.0)
         columns = {name: (hours(steps), values) for name, (steps, values) in run.metrics.columns.items()}
         kept.append(replace(run, metrics=replace(run.metrics, columns=columns, env_steps=hours(run.metrics.env_steps))))

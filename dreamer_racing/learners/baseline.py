@@ -215,7 +215,7 @@ def check_layers(saved: dict[str, Any], present: dict[str, Any]) -> None:
                 f"set {setting}={saved[key]}, or start a new run."
             )
     for key, what in (("numbers", "observed numbers, as of env.vector"), ("actions", "actions")):
-        if (there := saved.get(key, present[key])) != present[key]:
+        if (there := saved[key]) != present[key]:
             raise ValueError(
                 f"The checkpoint's networks were made for {there} {what}, this learner's for {present[key]}: set it as "
                 "it was, or start a new run."

@@ -27,6 +27,7 @@ from dreamer_racing.losses import (
     find_objective,
     gradient_of_actions,
     imagine,
+    joined,
     lambda_return,
     open_loop_loss,
 )
@@ -91,15 +92,16 @@ class DreamerV3(WorldModelLearner):
         # World model: infer the records' latents, and predict rewards, episode ends and targets (Eq. 4, 5).
         with timed("world_model"):
             losses, latents = self.world_model_loss(batch)
-            losses |= self.drift_losses(latents, batch)
+            losses = joined(losses, self.drift_losses(latents, batch))
             if numbers.open_loop_steps:
-                losses["loss_open_loop"] = open_loop_loss(model, latents, batch, numbers.open_loop_steps)
+                ahead = open_loop_loss(model, latents, batch, numbers.open_loop_steps)
+                losses = joined(losses, {"loss_open_loop": ahead})
         self.store_latents(latents)
 
         # Imagination takes much of an update's time, so it may be left out of some.
         if self.updates % self.config.imagination_every:
             with timed("imagine"):
-                return losses | self.replay_critic_losses(latents, batch)
+                return joined(losses, self.replay_critic_losses(latents, batch))
 
         with timed("imagine"):
             # Imagination: starting from latents of the records, the policy acts H times in the world model.
@@ -143,19 +145,19 @@ class DreamerV3(WorldModelLearner):
             if wrong := [name for name in metrics if name.startswith("loss")]:
                 raise ValueError(f"loss.actor: the metric {wrong[0]!r} would be added to the losses: rename it.")
             penalty, measured = self.policy_penalty(trajectory)
-            losses |= metrics | measured | {"loss_actor": objective + penalty}
+            losses = joined(losses, metrics, measured, {"loss_actor": objective + penalty})
 
             # Critic: two-hot regression on the λ-returns of replayed and of imagined steps (Eq. 10). If every record
             # was a start, replayed returns bootstrap from its imagined return, which is better than the critic's value.
             shape = batch["terminated"].shape
             bootstrap = returns[0].detach().reshape(shape) if num_starts is None else None
-            losses |= self.replay_critic_losses(latents, batch, bootstrap)
+            losses = joined(losses, self.replay_critic_losses(latents, batch, bootstrap))
             regression, logits = critic_loss(critic, features, returns.detach(), numbers.slow_critic_scale)
-            losses["loss_critic"] = (weight * regression).mean()
+            losses = joined(losses, {"loss_critic": (weight * regression).mean()})
 
         with torch.no_grad():
             expected = critic.two_hot.decode(logits)
-            return losses | {
+            measured = {
                 "return_mean": returns.mean(),
                 "return_scale": scale,
                 "imagined_reward": reward.mean(),
@@ -163,6 +165,7 @@ class DreamerV3(WorldModelLearner):
                 "value_mean": expected.mean(),
                 "value_error": (expected - returns).abs().mean(),
             }
+            return joined(losses, measured)
 
     def policy_penalty(self, trajectory: Trajectory) -> tuple[Tensor, dict[str, Tensor]]:
         """Return what is added to any objective, a scalar, and metrics.

@@ -30,7 +30,7 @@ from dreamer_racing.learners.config import LearnerConfig
 from dreamer_racing.learners.gradient_step import check_scalars, restore
 from dreamer_racing.learners.learner import Timer, untimed
 from dreamer_racing.learners.update import WorldModelLearner
-from dreamer_racing.losses import LatentPPOLosses, Trajectory, find_objective, normalized, rollout_return
+from dreamer_racing.losses import LatentPPOLosses, Trajectory, find_objective, joined, normalized, rollout_return
 from dreamer_racing.losses.config import KL_TOLERANCE, PPOUpdateConfig
 from dreamer_racing.modules import Agent
 from dreamer_racing.modules.heads import ActionDistribution, TwoHotHead, symlog
@@ -123,7 +123,7 @@ class LatentPPO(WorldModelLearner):
             if self.device.type == "cuda":
                 kept = kept.clone()  # the guard reads it two checks later; new rollouts overwrite the storage
             self._guard.check(updated, kept, of=" of the actor's update")
-            metrics |= updated
+            metrics = joined(metrics, updated)
         self.average_weights()
         return metrics
 
@@ -138,11 +138,11 @@ class LatentPPO(WorldModelLearner):
         # the policy by changed latents.
         with timed("world_model"):
             losses, latents = self.world_model_loss(batch)
-            losses |= self.drift_losses(latents, batch)
+            losses = joined(losses, self.drift_losses(latents, batch))
         self.store_latents(latents)
         # Agent's critic: its regression on replayed λ-returns also trains the latents to tell what returns depend on.
         with timed("imagine"):
-            losses |= self.replay_critic_losses(latents, batch)
+            losses = joined(losses, self.replay_critic_losses(latents, batch))
         return losses
 
     def update_actor(self) -> dict[str, Tensor]:
@@ -201,13 +201,13 @@ class LatentPPO(WorldModelLearner):
 
             moved = self.actor_update.run(len(taken), actor_loss)
             moved |= {"ppo/loss": moved.pop("loss"), "gradient_norm/actor": moved.pop("gradient_norm")}
-        return {
+        measured = {
             "ppo/critic_loss": learned["loss"],
             "gradient_norm/own_critic": learned["gradient_norm"],
             "ppo/explained_variance": 1.0 - (returns - value).var() / returns.var().clamp_min(1e-8),
             "entropy": behavior.entropy().mean(),
-            **moved,
         }
+        return joined(measured, moved)
 
     @torch.no_grad()
     def _value(self, acted: TensorDictBase) -> Tensor:
@@ -362,7 +362,7 @@ class PPOUpdate:
         elif good:
             self.optimizer.step()
         self.optimizer.zero_grad(set_to_none=True)
-        return {"loss": loss.detach(), **metrics, "gradient_norm": norm}
+        return joined({"loss": loss.detach(), "gradient_norm": norm}, metrics)
 
     def _control(self, kl: Tensor) -> None:
         """Lower the learning rate if the divergence is well above its target; raise it, at most to 1, if well below.

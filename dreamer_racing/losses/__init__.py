@@ -29,6 +29,7 @@ from dreamer_racing.losses.world_model import (
     Vector,
     WorldModelLoss,
     find_targets,
+    joined,
     kl_losses,
     open_loop_loss,
 )
@@ -60,6 +61,7 @@ __all__ = [
     "find_targets",
     "gradient_of_actions",
     "imagine",
+    "joined",
     "kl_losses",
     "lambda_return",
     "normalized",

@@ -8,6 +8,8 @@ privileged vector, M = B·T records.
 
 from __future__ import annotations
 
+from collections import Counter
+from collections.abc import Mapping
 from typing import ClassVar, NamedTuple
 
 import torch
@@ -27,11 +29,6 @@ from dreamer_racing.settings import import_own, suggestion
 
 OPEN_LOOP_STARTS = 64
 """N, records of a batch from which `open_loop_loss` predicts; this project's choice, which limits its time."""
-RESERVED = (
-    "loss", "loss_reward", "loss_continue", "reward_error", "loss_dynamics", "loss_representation", "kl", "loss_drift",
-    "policy_drift", "loss_replay_critic", "loss_open_loop", "loss_actor", "loss_critic",
-)  # fmt: skip
-"""Names of losses and metrics that targets cannot have."""
 
 
 class Latents(NamedTuple):
@@ -115,18 +112,14 @@ class WorldModelLoss(nn.Module):
         features = join_features(posterior.belief, posterior.state)
 
         # Targets: what the latents must encode besides rewards.
-        losses: dict[str, Tensor] = {}
-        for name, target in self.targets.items():
-            found = target(posterior, features, embedding, batch)
-            if taken := sorted(found.keys() & {*losses, *RESERVED}):
-                raise ValueError(f"Target {name} returns {', '.join(taken)}, which another loss has: rename it.")
-            losses |= found
+        of_targets = [target(posterior, features, embedding, batch) for target in self.targets.values()]
 
         # Rewards received on arriving at each record, and whether the episode continues there.
         reward, goes_on, head = batch.get("reward"), 1.0 - batch.get("terminated").float(), model.reward_head
         logits = head(features)
         with torch.no_grad():
             reward_error = (head.two_hot.decode(logits) - reward).abs().mean()
+        losses: dict[str, Tensor] = {}
         losses["loss_reward"] = head.two_hot.cross_entropy(logits.log_softmax(-1), reward).mean()
         losses["loss_continue"] = F.binary_cross_entropy_with_logits(model.continue_head(features), goes_on)
         losses["reward_error"] = reward_error
@@ -138,7 +131,19 @@ class WorldModelLoss(nn.Module):
         losses["loss_dynamics"] = self.config.dynamics_scale * dynamics.mean()
         losses["loss_representation"] = self.config.representation_scale * representation.mean()
         losses["kl"] = kl.mean()
-        return losses, Latents(posterior.belief, posterior.state)
+        return joined(*of_targets, losses), Latents(posterior.belief, posterior.state)
+
+
+def joined(*parts: Mapping[str, Tensor]) -> dict[str, Tensor]:
+    """Join losses and metrics by name, also those of one's own.
+
+    Raises:
+        ValueError: If a name stands in two of the parts.
+    """
+    names = Counter(name for part in parts for name in part)
+    if twice := [name for name, number in names.items() if number > 1]:
+        raise ValueError(f"Two losses or metrics are called {' and '.join(twice)}: rename yours.")
+    return {name: value for part in parts for name, value in part.items()}
 
 
 def open_loop_loss(model: WorldModel, latents: Latents, batch: TensorDictBase, steps: int) -> Tensor:

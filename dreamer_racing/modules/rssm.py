@@ -21,7 +21,6 @@ from torch.autograd.function import FunctionCtx
 from dreamer_racing.modules.layers import NormedLinear, SplitNormedLinear, autocast_type, linear, unrolled
 from dreamer_racing.modules.recurrent_cells import BlockGRUCell, DenseGRUCell
 from dreamer_racing.modules.sizes import ModelSize
-from dreamer_racing.settings import check_choice
 
 StepStart = Callable[[int, Tensor, Tensor], tuple[Tensor, ...]]
 """Function of a step's index and the latents after the step before that returns the latents the step starts from."""
@@ -148,9 +147,6 @@ class RSSM(nn.Module):
         embedding: E.
         action: A.
 
-    Raises:
-        ValueError: If the size has an unknown ``recurrence``.
-
     Example:
         >>> import torch
         >>> from dreamer_racing.modules import get_size
@@ -169,7 +165,6 @@ class RSSM(nn.Module):
 
     def __init__(self, size: ModelSize, embedding: int, action: int) -> None:
         super().__init__()
-        check_choice(f"model size {size.name}: recurrence", size.recurrence, self.cells)
         self.latents, self.classes, self.sampled = size.latents, size.classes, size.sampled
         self.few_kernels = False
         self.uniform = nn.Buffer(torch.tensor(1.0 / size.classes), persistent=False)

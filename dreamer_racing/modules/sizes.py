@@ -76,7 +76,7 @@ class ModelSize:
         for name, width in (("belief", self.belief), ("cnn_depth times the last of cnn_multipliers", channels)):
             if width % self.blocks:
                 raise ValueError(f"{name}={width}: must be a multiple of blocks={self.blocks}.")
-        if self.classes > 256:
+        if self.sampled and self.classes > 256:
             raise ValueError(f"classes={self.classes}: at most 256, as the replay stores a class in a byte.")
 
     @property

@@ -147,7 +147,7 @@ class RunDirectory:
     def note_start(self, env_steps: int, overrides: Sequence[str], commit: str | None) -> None:
         """Append a start or resume of the run at ``env_steps``, with its overrides and commit, to `starts`."""
         line = {"env_steps": env_steps, "overrides": list(overrides), "commit": commit}
-        torn = self.starts.exists() and not self.starts.read_bytes().endswith(b"\n")  # by a kill, or a full disk
+        torn = self.starts.exists() and self.starts.read_bytes()[-1:] not in (b"", b"\n")  # by a kill, or a full disk
         with self.starts.open("a", encoding="utf-8") as file:
             file.write("\n" * torn + json.dumps({"date": f"{datetime.now(UTC):%Y-%m-%d %H:%M}", **line}) + "\n")
 

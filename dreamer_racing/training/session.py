@@ -235,7 +235,7 @@ class Session:
                 failure = error
         self._another_follows = under_way is not None
         yield rollout
-        if failure is not None:
+        if failure is not None and not self.at_end:
             raise failure
         if under_way is not None:
             self._count(under_way, saves=self._saves)

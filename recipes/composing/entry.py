@@ -181,8 +181,7 @@ def normalise_argument(argument: str) -> str:
 
 
 def _in_digits(value: str) -> str:
-    whole = WHOLE.fullmatch(value) and float(value).is_integer()
-    return str(int(float(value))) if whole else value
+    return str(int(float(value))) if WHOLE.fullmatch(value) and float(value).is_integer() else value
 
 
 def in_plain_words(error: HydraException, recipe_name: str, overrides: Sequence[str]) -> str:

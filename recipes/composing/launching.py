@@ -1,5 +1,6 @@
 """Launch a training recipe: compose its configuration, open a session, and start or resume the run."""
 
+import filecmp
 import shlex
 import signal
 import sys
@@ -85,13 +86,13 @@ def compose_run(config: DictConfig) -> tuple[DictConfig, list[str]]:
     """Return the configuration of a new or resumed run, and the overrides that it is composed from."""
     overrides = given = list(HydraConfig.get().overrides.task)
     if config.resume:
-        config, overrides = resumed_config(config.algorithm, config.resume, overrides)
+        config, overrides, known = resumed_config(config.algorithm, config.resume, overrides)
     if config.get("tuned") == "auto":
-        known, overrides = config, merge_overrides(overrides, [f"tuned={tune(config)}"])
+        overrides = merge_overrides(overrides, [f"tuned={tune(config)}"])
         config = hydra.compose(str(HydraConfig.get().job.config_name), overrides)  # --config-name=, if given
-        if known.resume:
-            keep_trained_on(config, known, given)
-    check_overrides(config, overrides)
+    if config.resume:
+        keep_trained_on(config, known, given)
+    check_overrides(config, given)
     if "loss" in config:
         check_read(config, given)
     return config, overrides
@@ -223,8 +224,8 @@ def print_thread_error(failure: threading.ExceptHookArgs) -> None:
         threading.__excepthook__(failure)
 
 
-def resumed_config(algorithm: str, resume: str, overrides: list[str]) -> tuple[DictConfig, list[str]]:
-    """Return the saved configuration of the run to resume with the new overrides applied, and all its overrides."""
+def resumed_config(algorithm: str, resume: str, overrides: list[str]) -> tuple[DictConfig, list[str], DictConfig]:
+    """Return a saved run's configuration with the new overrides applied, all its overrides, and it as it was saved."""
     if is_agent(resume) or (not Path(resume).exists() and is_agent(agent_path(resume))):
         raise ValueError(f"resume={resume} is an agent, not a run to resume: start one with init_from={resume}.")
     directory = RunDirectory.of(latest_checkpoint(resume))
@@ -245,20 +246,20 @@ def resumed_config(algorithm: str, resume: str, overrides: list[str]) -> tuple[D
     merged = merge_overrides(merge_overrides(saved, [as_override("run_dir", run_dir)]), overrides)
     config = hydra.compose(algorithm, merged)
     restore_saved_settings(config, known, {override_key(override) for override in overrides})
-    keep_trained_on(config, known, overrides)
-    return config, merged
+    return config, merged, known
 
 
 def keep_trained_on(config: DictConfig, known: DictConfig, overrides: Sequence[str]) -> None:
     """Set the track and the drone of files to what a run has kept, and refuse what it was not trained on."""
     config.track_description = known.track_description
-    if config.env.preset.endswith(SUFFIXES) and "env.preset" not in map(override_key, overrides):
-        config.env.preset = known.env.preset
+    drone, kept, given = config.env.preset, known.env.preset, "env.preset" in map(override_key, overrides)
+    if drone.endswith(SUFFIXES) and (not given or (Path(kept).is_file() and filecmp.cmp(drone, kept, shallow=False))):
+        config.env.preset = kept
     for name in (*TRAINED_ON, *OBSERVATION_SETTINGS):
         trained, now = OmegaConf.select(known, name), OmegaConf.select(config, name)
         if now != trained:
             raise ValueError(
-                f"{known.run_dir} was trained with {name}={format_value(trained)}, which cannot change to "
+                f"{config.run_dir} was trained with {name}={format_value(trained)}, which cannot change to "
                 f"{format_value(now)}: start a new run, or leave out what sets it."
             )
 

@@ -207,8 +207,12 @@ def test_runs_of_different_speed_are_compared_at_the_same_hour(tmp_path, axis, c
         rows = [(1000, 1.0, hour, hour / 2), (2000, 3.0, 2 * hour, hour)]
         write_metrics(run, ["episode/return", "wall_clock", "cpu_clock"], rows)
     write_run(tmp_path, "dreamer_v3_circle_seed0")
+    resumed = write_run(tmp_path, "latent_ppo_circle_seed0", algorithm="latent_ppo")  # where the clock is not known
+    rows = [(1000, 1.0, 3600.0, 1800.0), (2000, 3.0, "", "")]
+    write_metrics(resumed, ["episode/return", "wall_clock", "cpu_clock"], rows)
     drawn = curves_of(tmp_path, axis=axis)
     assert f"dreamer_v3_circle_seed0 left out: it has no {clock}, which axis={axis} needs" in drawn.problems
+    assert f"latent_ppo_circle_seed0 left out: its {clock} ends at 1,000 env_steps" in drawn.problems
     slow, fast = drawn.curves
     assert (drawn.axis, slow.x[-1], slow.key.algorithm) == (axis, longest, "ppo")
     for curve, hours, value in ((slow, 0.75, 2.0), (fast, 0.375, 2.0), (fast, 0.5, 3.0)):

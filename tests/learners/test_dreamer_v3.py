@@ -472,6 +472,19 @@ def test_losses_and_metrics_that_are_no_scalar_tensors_are_refused_by_name(monke
         learner.update(make_batch())
 
 
+class Entropy(Target):
+    """Has the name of a metric of the actor."""
+
+    def forward(self, posterior, features, embedding, batch):
+        return {"entropy": features.mean()}
+
+
+def test_a_metric_of_a_target_is_not_replaced_by_the_actor_s(monkeypatch):
+    monkeypatch.setitem(TARGETS, "own", (Entropy,))
+    with pytest.raises(ValueError, match="Two losses or metrics are called entropy"):
+        learner_of(seed=0, **CONFIG | {"world_model": "own"}).update(make_batch())
+
+
 def test_averaged_weights_move_by_their_rate_and_fly_evaluations():
     learner = learner_of(seed=0, **CONFIG | {"average_rate": 0.25})
     assert learner.evaluation_policy().actor is learner.averaged.actor

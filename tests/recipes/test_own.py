@@ -166,7 +166,10 @@ def test_a_run_keeps_the_track_of_a_file_that_is_gone(track: Track, tmp_path: Pa
     completed("dreamer_v3", f"track={file}", f"env.preset={drone}", *short, "run_dir=run", cwd=tmp_path, before=UNDRAWN)
     write(load_track("circle"), file)
     drone.write_text("preset: easy\nparameters: {mass: 0.9}\n")  # for another run
-    longer = ["budget=none", "total_env_steps=240"]
+    (tmp_path / "copy.yaml").write_text("preset: easy\nparameters: {mass: 0.62}\n")  # the same drone
+    refusal = refused("dreamer_v3", "resume=run", f"env.preset={drone}", cwd=tmp_path)
+    assert f"run was trained with env.preset={directory / 'drone.yaml'}, which cannot change to {drone}" in refusal
+    longer = ["budget=none", "total_env_steps=240", "env.preset=copy.yaml"]
     resumed = completed("dreamer_v3", "resume=run", *longer, cwd=tmp_path, before=UNDRAWN)
     assert f"track: {file} has changed since the run started; the run keeps the old track\n" in resumed.stdout
     # a choice of settings composes everything anew, up to what is noted
@@ -174,7 +177,8 @@ def test_a_run_keeps_the_track_of_a_file_that_is_gone(track: Track, tmp_path: Pa
     again = completed("dreamer_v3", "resume=run", *anew, cwd=tmp_path, before=UNDRAWN)
     assert "has changed since" in again.stdout
     starts = RunDirectory(directory).read_starts()
-    assert all(f"env.preset={drone}" in start["overrides"] for start in starts), "as given, for `experiment` to compare"
+    given = [next(each for each in start["overrides"] if "preset" in each) for start in starts]
+    assert given == [f"env.preset={drone}", "env.preset=copy.yaml", "env.preset=copy.yaml"], "not the run's own copy"
     completed("evaluate", "checkpoint=run", f"track={file}", *EVALUATION, cwd=tmp_path, before=UNDRAWN)
     export = ("export", f"checkpoint={directory}", "agent=mine", "commit=abc1234")
     assert "was flown on another track, or" in refused(*export, cwd=tmp_path)

@@ -114,16 +114,16 @@ def test_a_resumed_run_cannot_change_its_track(run_dir: Path) -> None:
         ("env.preset=faithful", "env.preset=easy"), ("env=betaflight", "env.preset=easy"),
         ("tuned=race", "env.control_rate=50.0"),
     ):  # fmt: skip
-        with (
-            pytest.raises(ValueError, match=f"trained with {there}.*, which cannot change"),
-            hydra.initialize_config_dir(str(CONFIG), version_base="1.3"),
-        ):
-            training.resumed_config("dreamer_v3", str(run_dir), [override])
+        with hydra.initialize_config_dir(str(CONFIG), version_base="1.3"):
+            config, _, known = training.resumed_config("dreamer_v3", str(run_dir), [override])
+        with pytest.raises(ValueError, match=f"trained with {there}.*, which cannot change"):
+            training.keep_trained_on(config, known, [override])
     with pytest.raises(ValueError, match="was trained by dreamer_v3: continue it with recipes/dreamer_v3.py."):
         training.resumed_config("latent_ppo", str(run_dir), [])
     same = ["track=circle", "env.control_rate=50", "seed=1"]
     with hydra.initialize_config_dir(str(CONFIG), version_base="1.3"):
-        config, overrides = training.resumed_config("dreamer_v3", str(run_dir), same)
+        config, overrides, known = training.resumed_config("dreamer_v3", str(run_dir), same)
+    training.keep_trained_on(config, known, same)
     assert config.env.control_rate == 50
     names = [override.partition("=")[0] for override in overrides]
     assert len(names) == len(set(names)), "an override stands twice"

@@ -8,9 +8,30 @@ from itertools import pairwise
 import pytest
 import torch
 
-from dreamer_racing.training.schedule import MEDIAN_WINDOW, PATIENCE, ModelLag, Ramp, RampClock, ReplayRatio
+from dreamer_racing.losses import LossConfig
+from dreamer_racing.training.schedule import (
+    MEDIAN_WINDOW,
+    PATIENCE,
+    ModelLag,
+    Ramp,
+    RampClock,
+    ReplayRatio,
+    Schedule,
+    ScheduleConfig,
+)
+from tests.training.test_episodes import episodes
 
 HALF = {"to": 0.99, "begin": 0.5}
+
+
+def test_the_hardest_gate_is_that_of_the_moment():
+    schedule = Schedule(ScheduleConfig(), {"loss": LossConfig()}, 1000, num_gates=3)
+    assert schedule.observe(episodes([1], [1], [1]), 10).keys() == {"episode/pass_share"}, "no mean over a row"
+    schedule.observe(episodes([7, 1, 1], [2, 1, 1], [0, 2, 3]), 20)  # two crashes at gate 1
+    assert schedule.hardest_gate() == {"episode/hardest_gate": 1.0}
+    schedule.observe(episodes([2] * 9, [2] * 9, [1] * 9), 30)  # past 1, and a crash at gate 2
+    assert schedule.hardest_gate() == {"episode/hardest_gate": 2.0}
+    assert Schedule(ScheduleConfig(), {"loss": LossConfig()}, 1000).hardest_gate() == {}
 
 
 @pytest.mark.parametrize(
