@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import importlib
+import math
 import re
 import sys
 from dataclasses import replace
 from pathlib import Path
-from types import ModuleType
+from types import ModuleType, SimpleNamespace
 from typing import Any
 
 import gymnasium
@@ -237,3 +239,16 @@ def test_states_are_copies() -> None:
     worlds.step(ACTIONS[1])
     assert isinstance(state, RaceState)
     assert torch.equal(state.position, before.position) and torch.equal(state.action, before.action)
+
+
+def test_the_example_rewards_a_camera_that_looks_at_the_gate(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.syspath_prepend(str(Path(__file__).parents[2] / "examples" / "rewards"))
+    pitch = math.radians(25.0)  # nose down, so that the camera, which looks 25 degrees up, looks level along x
+    attitude = torch.tensor([[math.cos(pitch / 2), 0.0, math.sin(pitch / 2), 0.0]]).expand(3, 4)
+    gates = torch.tensor([[5.0, 0.0, 0.0], [-5.0, 0.0, 0.0], [0.0, 5.0, 0.0]])
+    after = SimpleNamespace(position=torch.zeros(3, 3), attitude=attitude, gate_position=gates)
+    rewards = importlib.import_module("looking").looking(SimpleNamespace(after=after, default_reward=torch.ones(3)))
+    torch.testing.assert_close(rewards, torch.tensor([1.3, 0.7, 1.0]))
+    _, plain = fly()
+    _, looking = fly(reward="looking:looking")
+    assert not torch.equal(plain[0], looking[0]) and (plain[0] - looking[0]).abs().max() <= 0.3 + 1e-6
