@@ -149,8 +149,7 @@ class DreamerV3(WorldModelLearner):
 
             # Critic: two-hot regression on the λ-returns of replayed and of imagined steps (Eq. 10). If every record
             # was a start, replayed returns bootstrap from its imagined return, which is better than the critic's value.
-            shape = batch["terminated"].shape
-            bootstrap = returns[0].detach().reshape(shape) if num_starts is None else None
+            bootstrap = None if num_starts else returns[0].detach().reshape(batch["terminated"].shape)
             losses = joined(losses, self.replay_critic_losses(latents, batch, bootstrap))
             regression, logits = critic_loss(critic, features, returns.detach(), numbers.slow_critic_scale)
             losses = joined(losses, {"loss_critic": (weight * regression).mean()})
