@@ -43,8 +43,8 @@ How well each algorithm flies here, what that took, and the command that runs it
 - **DreamerV3** (`recipes/dreamer_v3.py`) learns in imagination. With the true state in training it races them, too, by
   every seed of today's default (all but two stopped by hand). Success swings on Figure 8, by one seed to its end, and
   sampled success on all three, too.
-- **From images alone** both race Circle, where DreamerV3 swings. Latent PPO races Kidney by one seed of two, sooner with
-  a reward for looking at the next gate; DreamerV3 does not, for [reasons partly known](kidney_from_images.md).
+- **From images alone** both race Circle, where DreamerV3 swings. Latent PPO races Kidney by one seed of two, sooner
+  with a reward for looking at the next gate; DreamerV3 does not, for [reasons partly known](kidney_from_images.md).
 - **PPO and SAC from images** were only begun. PPO from the true state flies three clean laps after 3 to 11 minutes.
 """
 METHOD = """## How success is measured
