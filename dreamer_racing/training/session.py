@@ -235,8 +235,10 @@ class Session:
                 failure = error
         self._another_follows = under_way is not None
         yield rollout
-        if failure is not None and not self.at_end:
-            raise failure
+        if failure is not None:
+            if not self.at_end:
+                raise failure
+            self.write_line(f"workers were lost after the last rollout that was needed: {failure}")
         if under_way is not None:
             self._count(under_way, saves=self._saves)
             yield under_way
