@@ -196,7 +196,7 @@ def test_a_run_without_images(tmp_path: Path) -> None:
     completed("evaluate", "checkpoint=run", "episodes=2", "num_envs=2", cwd=tmp_path, before=UNDRAWN)
     assert len(json.loads((run_dir / "evaluation" / "evaluation.json").read_text())["stochastic"]["episodes"]) == 2
     said = refused("dreamer_v3", "resume=run", "env.from_pixels=true", "total_env_steps=9000", cwd=tmp_path)
-    assert "another loss or other observations" in said
+    assert "was trained with env.from_pixels=false, which cannot change to true" in said
 
 
 POISON = """
