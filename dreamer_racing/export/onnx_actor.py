@@ -42,10 +42,19 @@ _LAYOUT = {
     "files": {"onnx": {"sha256": str}, **{f"{kind}?": {"name": str, "sha256": str} for kind in ("weights", *PARTS)}},
     "model": {},
     "weights_sha256": str,
-    "action": {"channels": [{"name": str, "unit": str, "offset": float, "scale": float}]},
+    "action": {
+        "channels": [{"name": str, "unit": str, "offset": float, "scale": float}],
+        "trained_half_widths?": {"mass?": float, "thrust?": float, "sag_max?": float},
+    },
     "control": {"rate_hz": float},
     "source": {"track?": str},
-    "rate_loop?": {"kind": str, "p?": [float], "d?": [float], "motor_time_constant_s?": float},
+    "rate_loop?": {
+        "kind": str,
+        "p?": [float],
+        "d?": [float],
+        "motor_time_constant_s?": float,
+        "trained_half_widths?": {"gains?": float, "motor_lag?": float},
+    },
     "camera?": {
         "width_px": int,
         "height_px": int,
@@ -338,6 +347,9 @@ def _inconsistency(contract: dict[str, Any]) -> str:
         lacking := [name for name in ("p", "d", "motor_time_constant_s") if loop.get(name) is None]
     ):
         return f"rate_loop lacks {', '.join(lacking)}"
+    for name in ("p", "d"):
+        if len(gains := loop.get(name) or (0.0, 0.0, 0.0)) != 3:
+            return f"rate_loop.{name} has {len(gains)} numbers, not one for each of roll, pitch and yaw"
     rate = contract["control"]["rate_hz"]
     return "" if rate > 0 else f"control.rate_hz is {rate}, not above 0"
 
@@ -406,6 +418,8 @@ def main() -> None:
     parser.add_argument("--steps", type=int, default=1000)
     parser.add_argument("--threads", type=int, default=1)
     arguments = parser.parse_args()
+    if arguments.steps < 1:
+        parser.error(f"--steps {arguments.steps}: must be at least 1.")
     logging.basicConfig(level=logging.INFO, format="%(message)s", stream=sys.stdout)
     try:
         actor = OnnxActor(arguments.path, threads=arguments.threads)

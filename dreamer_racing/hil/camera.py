@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import math
 from typing import Any
 
@@ -15,12 +16,13 @@ from dreamer_racing.hil.attitude import rotation_matrix
 from dreamer_racing.hil.vehicle import Pose
 from dreamer_racing.settings import check_choice
 
+logger = logging.getLogger(__name__)
+
 
 class NoseCamera:
     """Renders images of a track, in the thread that created it only.
 
-    Attributes:
-        backend: The one in use, ``egl`` or ``osmesa``; with ``auto`` the first that works.
+    With ``auto`` the first back end that works is used; a warning says so if that is not EGL.
 
     Raises:
         ValueError: There is no such back end.
@@ -31,14 +33,16 @@ class NoseCamera:
         check_choice("renderer", backend, ("auto", *GL_LIBRARIES))
         model = build_scene(track, QuadrotorParameters(), camera).compile()
         reasons = []
-        for self.backend in GL_LIBRARIES if backend == "auto" else (backend,):
+        for name in GL_LIBRARIES if backend == "auto" else (backend,):
             try:
-                self._scene = open_scene(self.backend, model, camera)
+                self._scene = open_scene(name, model, camera)
                 break
             except RendererUnavailableError as error:
                 reasons.append(str(error))
         else:
             raise RendererUnavailableError(" ".join(reasons))
+        if reasons:  # the first choice is faster, and replays of this flight need the same one
+            logger.warning("renderer: %s, because: %s", name, " ".join(reasons))
         tilt = math.radians(camera.tilt)
         self._mount = np.array(camera.position)
         self._up = np.array((-math.sin(tilt), 0.0, math.cos(tilt)))

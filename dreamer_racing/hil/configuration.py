@@ -43,6 +43,7 @@ from dreamer_racing.settings import POSITIVE, Range, check_choice, check_setting
 logger = logging.getLogger(__name__)
 
 PILOT, IDENTIFY = "pilot", "identify"
+POLLED_IMU = ("msp", "msp_override")  # links whose samples answer the request of the tick before
 PILOT_RATE = 50.0  # Hz
 SIMULATED = ("simulated", "betaflight_sitl")  # links to simulated vehicles, which can hurt nobody
 ARMING = tuple(link for link in BETAFLIGHT if link != "msp_override")  # links that arm by a channel
@@ -50,6 +51,7 @@ OPERATORS = ("keyboard", "udp", "timed")
 THRUST_NUMBERS = ("mass", "full_thrust", "reference_voltage", "voltage")  # settings that make a `ThrustMap`
 SPARE = 5.0  # s added to the flight of actor=identify for its take-off
 UNLIMITED_RATE = 1e4  # rad/s: as good as no limit
+IDENTIFICATION_STILL_TIME = 25.0  # s; its longest time on the spot, steps of yaw, is 17 s
 
 
 LimitsConfig = make_dataclass(
@@ -151,7 +153,7 @@ def check(config: HilConfig) -> None:
             f"link_host={config.link_host} is another machine, maybe a real vehicle: use operator=keyboard or udp."
         )
     remote = operator_of(config) == "keyboard" and is_remote_terminal()
-    if config.arm and remote and config.link not in SIMULATED:
+    if config.arm and remote and not (config.link in SIMULATED and is_this_machine(config.link_host)):
         raise ValueError(
             f"operator=keyboard over ssh: if the network drops, the enable stays on and no kill arrives, and link="
             f"{config.link} may be a real vehicle. Use operator=udp, whose enable expires, with python -m "
@@ -231,10 +233,13 @@ def check_flight(config: HilConfig, contract: dict[str, Any], track: Track) -> l
             loop = check_rate_loop(contract, config.vehicle, config.force)
         elif config.arm and config.link in BETAFLIGHT:
             loop = check_flown_by_betaflight(contract, config.link, config.force)
+        elif config.arm and config.link not in SIMULATED:
+            loop = f"rate loop: not compared with that of the vehicle behind link={config.link}; for that give vehicle="
     notes = [] if loop is None else [loop]
     notes += check_ranges(contract, limits_of(config, track), given_limits(config))
     if config.actor not in (PILOT, IDENTIFY) and (thrust := thrust_map(vars(config))) is not None:
         notes += thrust_note(contract, thrust.collective_thrust_max)
+    notes += imu_note(contract, config.link)
     if config.betaflight_dump is not None:
         if config.link not in BETAFLIGHT:
             raise ValueError(
@@ -258,6 +263,17 @@ def check_flight(config: HilConfig, contract: dict[str, Any], track: Track) -> l
     return notes
 
 
+def imu_note(contract: dict[str, Any], link: str) -> list[str]:
+    """Return a note if a link's IMU samples are of another age than those of training."""
+    if (imu := contract.get("imu")) is None:
+        return []
+    trained, polled = imu["trained_errors"]["delay"], link in POLLED_IMU
+    if trained == polled:
+        return []
+    age = "are about one control step old" if polled else "are fresh"
+    return [f"imu: samples of link={link} {age}, and in training they were {trained} control steps old (env.imu=)"]
+
+
 def given_limits(config: HilConfig) -> dict[str, Any]:
     """Return the safety limits that the user has set."""
     return {name: value for name, value in vars(config.limits).items() if value is not None}
@@ -272,10 +288,10 @@ def without_body_rates(config: Mapping[str, Any]) -> bool:
 def limits_of(config: HilConfig, track: Track) -> SafetyLimits:
     """Return the safety limits of a flight: the user's, else those of pose source and flyer, else the default.
 
-    Body rates estimated from attitudes only lag behind them, and a hovering vehicle is not stranded.
+    Body rates estimated from attitudes only lag behind them, and identification turns on the spot for a while.
     """
     tolerances = {"rate_tolerance": UNLIMITED_RATE} if without_body_rates(vars(config)) else {}
-    hovers = {"still_time": 3600.0} if config.actor == IDENTIFY else {}
+    hovers = {"still_time": IDENTIFICATION_STILL_TIME} if config.actor == IDENTIFY else {}
     return SafetyLimits.of_track(track, **tolerances | hovers | given_limits(config))
 
 

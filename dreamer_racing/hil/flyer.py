@@ -16,6 +16,8 @@ from dreamer_racing.hil.camera import camera_of
 from dreamer_racing.hil.safety_limits import SafetyLimits
 from dreamer_racing.hil.vehicle import Pose, Setpoint
 
+CHANNELS = ("collective_thrust", "body_rate_x", "body_rate_y", "body_rate_z")
+"""An actor's actions, in the order of a `Setpoint`."""
 TOLERANCE = 0.1
 """Share by which gains and motors may differ from those of training, beyond its randomisation [choice]."""
 
@@ -95,6 +97,8 @@ def check_contract(contract: dict[str, Any], track: Track, rate: float | None = 
     """
     differing = []
     source, own_rate = contract["source"], contract["control"]["rate_hz"]
+    if (channels := [channel["name"] for channel in contract["action"]["channels"]]) != list(CHANNELS):
+        differing.append(f"action.channels are {', '.join(channels)}, not {', '.join(CHANNELS)}, in this order")
     geometry, found = source.get("track_sha256"), hash_track(track)
     if geometry is None:
         differing.append(
@@ -209,7 +213,8 @@ def check_ranges(contract: dict[str, Any], limits: SafetyLimits, user_limits: Co
     """Refuse an actor whose action range exceeds the safety limits, which would clip its actions.
 
     Returns:
-        What limits that the user has set clip, in words.
+        What limits that the user has set clip, and which swings within a control step the limits on changes clip, in
+        words.
 
     Raises:
         ValueError: A limit not set by the user clips; the message names it, both values, and what to set.
@@ -231,7 +236,28 @@ def check_ranges(contract: dict[str, Any], limits: SafetyLimits, user_limits: Co
         if name not in user_limits:
             raise ValueError(f"{words}. Set limits.{name}={_format(wanted)}, or a smaller one if clipping is intended.")
         clipped.append(words)
-    return clipped
+    return clipped + _clipped_swings(contract, limits)
+
+
+def _clipped_swings(contract: dict[str, Any], limits: SafetyLimits) -> list[str]:
+    """Return notes on swings over an actor's whole range that the limits clip: within a control step, or downwards."""
+    channels = {channel["name"]: channel for channel in contract["action"]["channels"]}
+    rate = contract.get("control", {}).get("rate_hz", 0.0)  # the pilot's contract has none: it does not swing
+    notes = []
+    for name, axes, unit in (
+        ("rate_slew", [f"body_rate_{axis}" for axis in "xyz"], "rad/s"),
+        ("thrust_slew", ["collective_thrust"], "m/s²"),
+    ):
+        swing = max((2.0 * abs(channels[axis]["scale"]) for axis in axes if axis in channels), default=0.0)
+        if (most := getattr(limits, name)) * (1.0 + 1e-6) < swing * rate:
+            notes.append(
+                f"limits.{name}={most:g} allows changes of {most / rate:.3g} {unit} a control step at {rate:g} Hz, and "
+                f"the actor may ask for {swing:.3g}: limits.{name}={swing * rate:g} clips nothing"
+            )
+    thrust = channels.get("collective_thrust")
+    if thrust is not None and (least := thrust["offset"] - abs(thrust["scale"])) < limits.thrust_min - 1e-6:
+        notes.append(f"limits.thrust_min={limits.thrust_min:g} clips the actor, which asks for as little as {least:g}")
+    return notes
 
 
 def _format(numbers: list[float]) -> str:

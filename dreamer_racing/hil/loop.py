@@ -223,7 +223,8 @@ class FlightLoop:
         # What fails gives no enable, a dropped command or no poses, so that safety cuts, or holds and then cuts.
         operator = self._use("the operator's switch", lambda: self._operator.poll(armed), Operator(False, False))
         heard = self._use("the link", self._link.listen, None)
-        imu = self._link.read_imu() if self._chain.needs_imu else []
+        samples = self._link.read_imu()  # read in any case, or they would pile up
+        imu = samples if self._chain.needs_imu else []
         refusal = self._link.refusal
         poses: list[Received] = self._use("the source of poses", self._poses.poll, [])
         inputs = Inputs(start, poses, operator, overrun, heard or [], self._dropped, imu, refusal)

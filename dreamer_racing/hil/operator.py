@@ -137,7 +137,8 @@ class KeyboardOperator:
     def close(self) -> None:
         """Restore the terminal's settings."""
         if self._before is not None:
-            self._termios.tcsetattr(self._terminal, self._termios.TCSADRAIN, self._before)
+            with contextlib.suppress(self._termios.error):  # the terminal was closed
+                self._termios.tcsetattr(self._terminal, self._termios.TCSADRAIN, self._before)
             self._before = None
 
 

@@ -34,8 +34,7 @@ class SafetyLimits:
     start_box: float = setting(0.3, _TOLERANCE)  # m, from the start along each axis, within which it may arm
     start_yaw_tolerance_degrees: float = setting(15.0, _DEGREES)  # difference from that heading within which it may arm
     start_tilt_degrees: float = setting(10.0, _DEGREES)  # tilt from level within which it may arm
-    # m/s above which it does not arm, or, when armed, counts as having left the start
-    start_speed: float = setting(0.2, _TOLERANCE)
+    start_speed: float = setting(0.2, _TOLERANCE)  # m/s above which it does not arm
     # s for which the enable must be released before it counts: a flicker starts no flight
     release_time: float = setting(0.2, Range(0, 10))
     # s after arming in which no thrust is sent: Betaflight arms at low throttle only
@@ -69,7 +68,7 @@ class SafetyLimits:
     velocity_window: float = setting(0.075, _SECONDS)  # s over which both are compared, see `motion.Odometer`
     tilt_max_degrees: float = setting(100.0, _DEGREES)  # tilt from level that may be exceeded for `tilt_time` only
     tilt_time: float = setting(0.2, _TOLERANCE)  # s
-    # s below `start_speed` after which a vehicle that has flown counts as crashed: racers never hover
+    # s without moving (`safety.MOVED`) after which a vehicle that has flown counts as crashed: racers never hover
     still_time: float = setting(1.0, Range(0, 3600, open_below=True))
     # s after arming by which it must have moved: a vehicle that is held fast must stop its motors
     lift_off_time: float = setting(3.0, Range(0, 3600, open_below=True))

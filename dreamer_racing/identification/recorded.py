@@ -7,7 +7,8 @@ from __future__ import annotations
 
 import csv
 import gzip
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -106,18 +107,32 @@ def read_table(path: Path) -> Recorded:
     """
     if not path.is_file():
         raise FileNotFoundError(f"There is no recording {path}.")
-    with gzip.open(path, "rt") if path.suffix == ".gz" else path.open() as file:
-        rows = list(csv.DictReader(file))
+    try:
+        with gzip.open(path, "rt") if path.suffix == ".gz" else path.open() as file:
+            rows = list(csv.DictReader(file))
+    except EOFError as error:
+        raise ValueError(f"{path} is cut off: {error}.") from error
     names = ("t", "thrust_cmd", "wx_cmd", "wy_cmd", "wz_cmd", "wx", "wy", "wz")
     if not rows or (lacking := [name for name in names if name not in rows[0]]):
         raise ValueError(
             f"{path} lacks {', '.join(lacking if rows else names)}: see `read_table` for the required columns."
         )
-    time, *columns = (np.array([float(row[name]) for row in rows]) for name in names)
-    force = np.array([float(row["az"]) for row in rows]) if "az" in rows[0] else np.full(len(rows), np.nan)
+    time, *columns = (_column(path, rows, name) for name in names)
+    force = _column(path, rows, "az") if "az" in rows[0] else np.full(len(rows), np.nan)
     command = np.column_stack(columns[:4])
     changes = np.flatnonzero(np.concatenate(([True], (np.diff(command, axis=0) != 0).any(1))))
     return _on_grid(time[changes], command[changes], time, np.column_stack(columns[4:]), time, force)
+
+
+def _column(path: Path, rows: Sequence[Mapping[str, str | None]], name: str) -> np.ndarray:
+    """Return a column of finite numbers."""
+    numbers = np.full(len(rows), np.nan)
+    for index, row in enumerate(rows):
+        with suppress(TypeError, ValueError):
+            numbers[index] = float(row[name] or "")
+        if not np.isfinite(numbers[index]):
+            raise ValueError(f"{path}, line {index + 2}: {name} is {row[name]!r}, not a finite number.")
+    return numbers
 
 
 def of_flight(flight: Flight) -> Recorded:

@@ -11,7 +11,7 @@ import select
 import socket
 import time
 from collections.abc import Callable, Sequence
-from contextlib import suppress
+from contextlib import ExitStack, suppress
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
@@ -219,8 +219,8 @@ def start_firmware(named: str, options: ProcessOptions, sockets: Sockets, settin
     motors = int(sockets.incoming.getsockname()[1])
     firmware = Firmware(program, settings, Ports(motors, options.state_port, options.channel_port, options.serial_port))
     try:
-        given = options.betaflight
-        if given is not None and convention_of(given) != convention_of(firmware.release):
+        given, found = options.betaflight, convention_of(firmware.release)
+        if given is not None and convention_of(given) != found:
             raise ValueError(f"betaflight={given}: the firmware reports release {firmware.release}; leave it out.")
         firmware.start()
         firmware.wait_for_serial()
@@ -244,20 +244,18 @@ def run(
 
     The sockets, opened for these options, are closed at the end, and a firmware that was started for it is stopped.
     """
-    controls: Controls = CommandReceiver(vehicle, options.failsafe)
-    release = options.betaflight if firmware is None else firmware.release
-    if release is not None:
-        controls = BetaflightSitl(vehicle, sockets.state.write, release, options.failsafe)
-    plant = Plant(vehicle, controls, delivery, sockets.poses.write, sockets.incoming if release is None else None)
-    duration = math.inf if options.duration is None else options.duration
-    try:
-        with GracefulExit() as stop:
-            host, port = sockets.incoming.getsockname()
-            logger.info("plant: %s, listens on %s:%d, poses to %d", vehicle.track.name, host, port, options.pose_port)
-            fly_in_real_time(plant, sockets.incoming, stop, duration)
-    finally:
-        sockets.close()
+    with ExitStack() as opened, GracefulExit() as stop:
+        opened.callback(sockets.close)
         if firmware is not None:
-            firmware.close()
-        logger.info(plant.summary())
+            opened.callback(firmware.close)
+        controls: Controls = CommandReceiver(vehicle, options.failsafe)
+        release = options.betaflight if firmware is None else firmware.release
+        if release is not None:
+            controls = BetaflightSitl(vehicle, sockets.state.write, release, options.failsafe)
+        plant = Plant(vehicle, controls, delivery, sockets.poses.write, sockets.incoming if release is None else None)
+        opened.callback(lambda: logger.info(plant.summary()))
+        host, port = sockets.incoming.getsockname()
+        logger.info("plant: %s, listens on %s:%d, poses to %d", vehicle.track.name, host, port, options.pose_port)
+        duration = math.inf if options.duration is None else options.duration
+        fly_in_real_time(plant, sockets.incoming, stop, duration)
     return plant

@@ -406,6 +406,7 @@ def test_the_flight_side_needs_no_torch(alone: bool, exported: Path, tmp_path: P
 def test_the_flight_side_measures_itself(exported: Path) -> None:
     done = python(onnx_actor.__file__, str(exported), "--steps", "30")
     assert done.returncode == 0, done.stderr
+    assert python(onnx_actor.__file__, str(exported), "--steps", "0").stderr.endswith("must be at least 1.\n")
     assert "30 steps, 1 thread(s): p50" in done.stdout and "p99" in done.stdout and "max" in done.stdout
 
 

@@ -19,6 +19,7 @@ from dreamer_racing.envs.tracks import load_track
 from dreamer_racing.export.contract import describe_rate_loop
 from dreamer_racing.export.onnx_actor import read_contract
 from dreamer_racing.hil.chain import ChainConfig, FlightChain, describe_outputs, read_inputs
+from dreamer_racing.hil.configuration import imu_note
 from dreamer_racing.hil.flyer import (
     Flyer,
     check_contract,
@@ -85,7 +86,39 @@ def test_what_safety_would_clip_is_refused_unless_it_is_meant():
     with pytest.raises(ValueError, match=r"limits.thrust_max=30 clips the actor, which asks for up to 42.\d+ m/s²"):
         check_ranges(contract, replace(limits, rate_max=(16.0, 16.0, 6.4)))
     said = check_ranges(contract, limits, user_limits=("rate_max", "thrust_max"))
-    assert [words.partition("=")[0] for words in said] == ["limits.rate_max", "limits.thrust_max"]
+    names = [words.partition("=")[0].removeprefix("limits.") for words in said]
+    assert names == ["rate_max", "thrust_max", "rate_slew", "thrust_slew"]
+
+
+def test_swings_that_the_limits_on_changes_clip_are_noted():
+    contract, limits = contract_of("circle"), SafetyLimits.of_track(CIRCLE)
+    contract["control"]["rate_hz"] = 50.0
+    said = check_ranges(contract, limits)
+    assert said == [
+        "limits.rate_slew=500 allows changes of 10 rad/s a control step at 50 Hz, and the actor may ask for 20: "
+        "limits.rate_slew=1000 clips nothing",
+        "limits.thrust_slew=700 allows changes of 14 m/s² a control step at 50 Hz, and the actor may ask for 26.7: "
+        "limits.thrust_slew=1333 clips nothing",
+    ]
+    wide = replace(limits, rate_slew=1000.0, thrust_slew=1333.0)
+    assert check_ranges(contract, wide) == []
+    assert check_ranges(contract, replace(wide, thrust_min=8.0)) == [
+        "limits.thrust_min=8 clips the actor, which asks for as little as 0"
+    ]
+
+
+def test_actions_in_another_order_are_refused():
+    contract = contract_of("circle")
+    contract["action"]["channels"].reverse()
+    with pytest.raises(ValueError, match=r"action.channels are body_rate_z, .*, not collective_thrust, body_rate_x, "):
+        check_contract(contract, CIRCLE)
+
+
+@pytest.mark.parametrize(("link", "delay", "said"), [("msp", 1, 0), ("udp", 0, 0), ("msp", 0, 1), ("mavlink", 1, 1)])
+def test_imu_samples_of_another_age_than_in_training_are_noted(link, delay, said):
+    notes = imu_note({"imu": {"trained_errors": {"delay": delay}}}, link)
+    assert len(notes) == said and all(f"they were {delay} control steps old" in words for words in notes)
+    assert imu_note({}, link) == []
 
 
 def trained_with(preset: str, **changed: Any) -> dict[str, Any]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import gzip
 import math
 from dataclasses import replace
 from pathlib import Path
@@ -197,6 +198,14 @@ def test_a_table_is_read_on_its_grid(tmp_path: Path) -> None:
     assert read.rates[150, 0] == pytest.approx(0.15, abs=0.002)
     with pytest.raises(FileNotFoundError, match="no recording"):
         read_recorded(tmp_path / "none.csv")
+    with open(path, "a") as file:
+        file.write("6.0,1.0\n")
+    with pytest.raises(ValueError, match=r"line 302: wx_cmd is None, not a finite number"):
+        read_recorded(path)
+    cut = tmp_path / "cut.csv.gz"
+    cut.write_bytes(gzip.compress(path.read_bytes())[:-20])
+    with pytest.raises(ValueError, match=r"cut.csv.gz is cut off"):
+        read_recorded(cut)
     path.write_text("t,wx\n0,0\n")
     with pytest.raises(ValueError, match="lacks thrust_cmd, wx_cmd"):
         read_recorded(path)

@@ -114,6 +114,8 @@ def test_a_terminal_over_a_network_answers_for_no_real_vehicle(operator, monkeyp
     hil.check(hil.HilConfig(actor="kidney", link="crsf", operator=operator))  # nothing is armed
     hil.check(hil.HilConfig(actor="kidney", link="crsf", operator="udp", arm=True))
     hil.check(hil.HilConfig(actor="kidney", operator=operator))  # simulated
+    with pytest.raises(ValueError, match=r"operator=keyboard over ssh.*operator=udp"):
+        hil.check(hil.HilConfig(actor="kidney", link_host="192.168.1.5", operator="keyboard", arm=True))
 
 
 @pytest.mark.parametrize(

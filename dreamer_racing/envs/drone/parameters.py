@@ -204,9 +204,9 @@ def _read_drone(path: Path) -> QuadrotorParameters:
     if not isinstance(changes, dict):
         raise ValueError(f"{path} is not a drone file: it needs preset: (a name) and parameters: (fields and values).")
     base = content.get("preset")
-    if base not in PRESETS:
+    if not isinstance(base, str) or base not in PRESETS:
         there = ", ".join(sorted(PRESETS))
-        raise ValueError(f"{path}: preset: {quoted(base)} is not one of {there}{suggestion(base, PRESETS)}.")
+        raise ValueError(f"{path}: preset: {quoted(base)} is not one of {there}{suggestion(str(base), PRESETS)}.")
     try:
         return _around_own_delay(PRESETS[base], _with_changes(PRESETS[base], changes))
     except (ValueError, TypeError) as error:

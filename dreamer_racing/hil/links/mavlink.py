@@ -2,7 +2,7 @@
 
 Not for ArduPilot, see docs/hil_wiring.md. Disarming is forced: it stops the motors in the air too, as the arm switch of
 the other links does. Unlike that switch it works in every mode, so it is not sent before this link has armed the
-vehicle: a flight of another pilot goes on.
+vehicle, nor once its HEARTBEAT says that it is armed in a mode that a pilot flies: the flight of a pilot goes on.
 
 Thrust is sent as the motors' command (`ThrustMap.to_motor`), which PX4 passes on unchanged with ``THR_MDL_FAC = 0``.
 
@@ -11,7 +11,7 @@ the whole is known, it is in the first) or in SYS_STATUS (mV; 65535: unknown). G
 HIGHRES_IMU (rad/s, m/s², FRD) or SCALED_IMU (mrad/s, mG): the vehicle must be set to send one of them as often as
 commands come.
 
-Reference: mavlink.io/en/messages/common.html.
+Reference: mavlink.io/en/messages/common.html; modes: PX4-Autopilot, ``px4_custom_mode.h``.
 """
 
 from __future__ import annotations
@@ -30,11 +30,17 @@ from dreamer_racing.hil.vehicle import GRAVITY, Command, Setpoint
 
 SYSTEM, AUTOPILOT = 1, 1  # IDs of the vehicle and of its autopilot
 IGNORE_ATTITUDE = 128  # ATTITUDE_TARGET_TYPEMASK: rates and thrust count, the attitude does not
+ARMED = 128  # MAV_MODE_FLAG_SAFETY_ARMED
 FORCE = 21196.0  # second parameter of COMPONENT_ARM_DISARM: disarm even in flight
 STANDARD_GRAVITY = 9.80665  # m/s² per G in SCALED_IMU
 FIRST_BATTERY = 0
 UNKNOWN = 65535  # mV, value of an unknown voltage
 _LONGEST = Setpoint(GRAVITY, np.ones(3))  # without zeros, which the wire omits at a message's end
+PX4 = 12  # MAV_AUTOPILOT_PX4
+MAIN_MODE = 16  # lowest bit of PX4's main mode in HEARTBEAT's custom_mode
+OFFBOARD = 6
+PILOT_MODES = {1: "manual", 2: "altitude", 3: "position", 5: "acro", 7: "stabilized"}
+"""PX4's main modes in which a pilot's sticks fly it."""
 ARM_TRIES = 5
 """Arm messages sent from the first armed command on: one may be lost, but a vehicle that has disarmed itself later must
 not be armed again [choice]."""
@@ -59,6 +65,7 @@ class MavlinkLink(TransportLink):
     """
 
     thrust: ThrustMap
+    _telemetry: MavlinkTelemetry
 
     def __init__(self, transport: Transport, thrust: ThrustMap) -> None:
         super().__init__(transport, thrust, MavlinkTelemetry())
@@ -76,7 +83,7 @@ class MavlinkLink(TransportLink):
         """Return the messages of a command: arm or disarm, if due, and the attitude target."""
         self._armed_for = self._armed_for + 1 if command.armed else 0
         self._has_armed = self._has_armed or command.armed
-        due = self._has_armed and self._armed_for <= ARM_TRIES
+        due = self._has_armed and self._armed_for <= ARM_TRIES and not self._telemetry.pilot_mode
         return (self._switch(command.armed) if due else b"") + self._attitude_target(command)
 
     def _switch(self, armed: bool) -> bytes:
@@ -107,7 +114,11 @@ class MavlinkLink(TransportLink):
 
 
 class MavlinkTelemetry(Telemetry):
-    """Reads BATTERY_STATUS (of the first battery), SYS_STATUS and the IMU's messages of the vehicle, by pymavlink.
+    """Reads BATTERY_STATUS (of the first battery), SYS_STATUS, HEARTBEAT and the IMU's messages, by pymavlink.
+
+    Attributes:
+        mode: PX4's main mode; None before a HEARTBEAT, or of another autopilot.
+        pilot_mode: Name of the mode in which a pilot flies the armed vehicle; empty if none is known to.
 
     Raises:
         ImportError: pymavlink is not installed.
@@ -115,6 +126,8 @@ class MavlinkTelemetry(Telemetry):
 
     def __init__(self) -> None:
         super().__init__()
+        self.mode: int | None = None
+        self.pilot_mode = ""
         self._parser = import_messages("The link mavlink").MAVLink(None)
         self._parser.robust_parsing = True  # damaged messages come out as BAD_DATA
 
@@ -129,9 +142,18 @@ class MavlinkTelemetry(Telemetry):
                 continue
             elif kind in SAMPLES:
                 self._add(self.imu_samples, SAMPLES[kind](message))
+            elif kind == "HEARTBEAT" and message.get_srcComponent() == AUTOPILOT and message.autopilot == PX4:
+                self.mode = message.custom_mode >> MAIN_MODE & 0xFF
+                self.pilot_mode = PILOT_MODES.get(self.mode, "") if message.base_mode & ARMED else ""
             elif kind in VOLTAGES and not (kind == "BATTERY_STATUS" and message.id != FIRST_BATTERY):
                 self._add(voltages, VOLTAGES[kind](message))
         return voltages
+
+    def refusal(self, armed: bool) -> str:
+        """Return why the vehicle does not, or would not, follow commands; empty if no reason is known."""
+        if self.pilot_mode:
+            return f"the pilot flies it, in {self.pilot_mode} mode"
+        return "" if armed or self.mode in (None, OFFBOARD) else "it is not in offboard mode"
 
 
 def _of_battery_status(message: Any) -> float | None:

@@ -201,6 +201,7 @@ def test_a_drone_comes_back_from_its_file(tmp_path: Path) -> None:
         ("preset: [", "is not valid YAML"),
         ("preset: easy\nparameters: 3", "is not a drone file"),
         ("preset: eazy", r"'eazy' is not one of .*\(did you mean easy\?\)"),
+        ("preset: [easy]", r"\['easy'\] is not one of"),
         ("preset: easy\nparameters: {mas: 1}", r"there is no parameter 'mas' \(did you mean mass\?\)"),
         ("preset: easy\nparameters: {mass: heavy}", "mass='heavy': must be a number"),
         ("preset: easy\nparameters: {mass: {kg: 1}}", "mass={'kg': 1}: mass has no fields"),

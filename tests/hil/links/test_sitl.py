@@ -14,7 +14,7 @@ import pytest
 from dreamer_racing.hil.betaflight.status import BOXIDS_REQUEST, REQUEST
 from dreamer_racing.hil.links import LinkConfig, make_link
 from dreamer_racing.hil.links.link import ASK_EVERY, ChannelLink, TransportLink
-from dreamer_racing.hil.links.mavlink import MavlinkLink
+from dreamer_racing.hil.links.mavlink import PILOT_MODES, MavlinkLink
 from dreamer_racing.hil.links.msp import IMU_REQUEST, OVERRIDE_REQUEST, MspTelemetry
 from dreamer_racing.hil.links.sitl import SerialOverTcp, SitlTransport
 from dreamer_racing.hil.vehicle import Command, Setpoint, at_rest, hover
@@ -243,6 +243,34 @@ def test_one_axis_of_mavlink(mavlink, command, rates):
     assert (target.target_system, target.target_component, target.type_mask) == (1, 1, 128)
     assert [target.body_roll_rate, target.body_pitch_rate, target.body_yaw_rate] == rates
     assert target.thrust == pytest.approx(math.sqrt(0.6 * 9.81 / 16.0))
+
+
+@pytest.mark.parametrize(
+    ("main_mode", "armed", "pilot"),
+    [(3, True, True), (1, True, True), (6, True, False), (4, True, False), (3, False, False)],
+)
+def test_what_a_pilot_flies_is_not_disarmed(mavlink, main_mode, armed, pilot):
+    common = pytest.importorskip("pymavlink.dialects.v20.common")
+
+    def hear(mode, is_armed):
+        beat = common.MAVLink_heartbeat_message(2, 12, 128 * is_armed, mode << 16, 4, 3)
+        mavlink._telemetry.read(bytes(beat.pack(common.MAVLink(None, 1, 1))))
+
+    hear(6, False)
+    assert mavlink.refusal == ""
+    mavlink.send(turning())
+    hear(main_mode, armed)
+    assert mavlink.refusal == (f"the pilot flies it, in {PILOT_MODES[main_mode]} mode" if pilot else "")
+    sent = [message.get_type() for message in messages(mavlink.send(at_rest()))]
+    assert sent == ["COMMAND_LONG"] * (not pilot) + ["SET_ATTITUDE_TARGET"]
+
+
+def test_mavlink_is_armed_in_offboard_mode_only(mavlink):
+    common = pytest.importorskip("pymavlink.dialects.v20.common")
+    assert mavlink.refusal == ""  # unknown
+    beat = common.MAVLink_heartbeat_message(2, 12, 0, 3 << 16, 4, 3)
+    mavlink._telemetry.read(bytes(beat.pack(common.MAVLink(None, 1, 1))))
+    assert mavlink.refusal == "it is not in offboard mode"
 
 
 def test_mavlink_arms_for_a_moment_and_disarms_for_good(mavlink):
