@@ -138,7 +138,7 @@ class ShippedAgent:
         """Return None, because an agent folder has no critic."""
 
 
-def load_trained(folder: Path, env: DroneRacingEnv, *agents: Agent) -> None:
+def load_trained(folder: Path, env: DroneRacingEnv, *agents: Agent, actor: bool = True) -> None:
     """Load the weights of an agent folder into agents that go on training in an environment, as `load_networks`.
 
     Raises:
@@ -149,17 +149,18 @@ def load_trained(folder: Path, env: DroneRacingEnv, *agents: Agent) -> None:
         check_size(contract["model"], agent.size)
     check_env(folder, contract, env)
     for agent in agents:
-        load_networks(folder, agent)
+        load_networks(folder, agent, actor)
 
 
-def load_networks(folder: Path, agent: Agent) -> None:
-    """Load the weights of an agent folder into encoder, RSSM and actor.
+def load_networks(folder: Path, agent: Agent, actor: bool = True) -> None:
+    """Load the weights of an agent folder into encoder, RSSM and, if wanted, actor.
 
     Raises:
         ValueError: If names or shapes differ.
     """
     weights = read_weights(folder / WEIGHTS)
-    parts = {"encoder.": agent.world_model.encoder, "rssm.": agent.world_model.rssm, "actor.": agent.actor}
+    parts = {"encoder.": agent.world_model.encoder, "rssm.": agent.world_model.rssm}
+    parts |= {"actor.": agent.actor} if actor else {}
     try:
         for prefix, part in parts.items():
             own = {key.removeprefix(prefix): value for key, value in weights.items() if key.startswith(prefix)}

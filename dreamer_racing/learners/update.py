@@ -379,22 +379,29 @@ class WorldModelLearner(ABC):
         restore(self.optimizer, state_dict["optimizer"])
         self.updates = state_dict["updates"]
 
-    def adopt(self, state_dict: dict[str, Any]) -> UnmatchedWeights:
+    def adopt(self, state_dict: dict[str, Any], behavior: bool = True) -> UnmatchedWeights:
         """Load the weights of another learner's ``state_dict``, whatever its algorithm; return what remains unmatched.
 
         They are the weights that were evaluated: the averaged ones if it kept them. Nothing else is loaded: no
         optimiser, counters, bounds of the actor's standard deviation, collected steps or statistics. A network outside
         the agent that the other learner lacks, such as a critic of the state, keeps its initial weights.
 
+        Args:
+            state_dict: Of the other learner.
+            behavior: Whether actor and critics are loaded, too; if not, only the world model with its targets.
+
         Raises:
             ValueError: If it was saved with another model size or environment; nothing is changed then.
         """
         unmatched = check_weights(state_dict, self.agent, self.own_networks)
         flying = state_dict.get("averaged", state_dict["agent"])
+        if not behavior:
+            flying = {name: value for name, value in flying.items() if name.startswith("world_model.")}
         for agent in filter(None, (self.agent, self.averaged)):
             load_parameters(agent, flying)
         for name, network in self.own_networks.items():
-            load_parameters(network, state_dict["own_networks"].get(name, {}))
+            if behavior or name == "world_model_loss":
+                load_parameters(network, state_dict["own_networks"].get(name, {}))
         return unmatched
 
     def _parameters(self) -> dict[str, list[nn.Parameter]]:

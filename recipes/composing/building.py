@@ -119,9 +119,8 @@ def make_evaluator(config: RunConfig, directory: Path, learner: Learner) -> Eval
     if is_race(config):
         worlds = {**shared_env_arguments(config), "start_noise": asked.start_noise}
         return EvaluationReport(directory, learner, worlds, asked.episodes, asked.video_steps)
-    seed = config.seed + 1
-    env = make_suite(config, min(8, asked.episodes), seed)
-    return ReturnReport(directory, learner, env, asked.episodes, asked.video_steps, seed)
+    env = make_suite(config, min(8, asked.episodes), config.seed + 1)
+    return ReturnReport(directory, learner, env, asked.episodes, asked.video_steps, config.seed + 1)
 
 
 def size_of(config: WorldModelRunConfig) -> ModelSize:
@@ -131,7 +130,7 @@ def size_of(config: WorldModelRunConfig) -> ModelSize:
 
 def load_initial_weights(learner: WorldModelLearner, config: WorldModelRunConfig, env: Environment) -> str:
     """Load the weights that ``init_from`` names into a new learner, if they fit; return a log line on them."""
-    source = str(config.init_from)
+    source, behavior = str(config.init_from), config.init_behavior
     folder = existing_agent_path("init_from", source)
     if not is_agent(folder):
         saved = saved_config(RunDirectory.of(latest_checkpoint(folder)).path)
@@ -140,16 +139,17 @@ def load_initial_weights(learner: WorldModelLearner, config: WorldModelRunConfig
             if there != here:
                 raise ValueError(f"{name}={here}: init_from={source} was trained with {name}={there}; use the same.")
         state, metadata = load_state(folder, "learner")
-        unmatched = learner.adopt(state)
+        unmatched = learner.adopt(state, behavior)
         kind = "averaged" if "averaged" in state else "trained"
-        line = f"weights: {kind}, of {folder} at {metadata['env_steps']:,} env_steps (init_from=), heads and critic too"
-        if unmatched.initial:
-            line += f"; not in that run, so untrained: {' and '.join(unmatched.initial)}"
+        which = "heads and critic too" if behavior else "the world model alone (init_behavior=false)"
+        line = f"weights: {kind}, of {folder} at {metadata['env_steps']:,} env_steps (init_from=), {which}"
+        line += f"; not in that run, so untrained: {' and '.join(unmatched.initial)}" if unmatched.initial else ""
         return line + (f"; not loaded: {' and '.join(unmatched.unused)}" if unmatched.unused else "")
     if not isinstance(env, DroneRacingEnv):
         raise ValueError(f"init_from={source}: this agent was trained on races, and this run has none.")
-    load_trained(folder, env, *filter(None, (learner.agent, learner.averaged)))
-    return f"weights: encoder, RSSM and actor of {folder} (init_from=); heads and critic start untrained"
+    load_trained(folder, env, *filter(None, (learner.agent, learner.averaged)), actor=behavior)
+    which = ("encoder, RSSM and actor", "heads and critic") if behavior else ("encoder and RSSM", "all others")
+    return f"weights: {which[0]} of {folder} (init_from=); {which[1]} start untrained"
 
 
 def make_learner(

@@ -162,6 +162,7 @@ class WorldModelRunConfig(ReplayRunConfig):
 
     # run, checkpoint or agent (docs/agents.md) whose weights a new run begins with; track and physics may differ
     init_from: str | None = None
+    init_behavior: bool = True  # whether actor and critics begin with those weights, too; false: only the world model
     # none: the algorithm as published; race: for racing on a CPU; images: race, but no network sees the simulator's
     # state in training; gpu: race for a GPU, unmeasured; suite: for the Control Suite on a CPU; auto: race or suite,
     # but none with env.from_pixels=false, budget=smoke or paper, or another model than cpu_small
@@ -349,11 +350,6 @@ def is_race(config: RunConfig) -> bool:
 store = ConfigStore.instance()
 for _algorithm, _schema in RECIPES.items():
     store.store(name=f"{_algorithm}_schema", node=_schema)
-for _group, _node in {
-    "env": EnvConfig,
-    "model": ModelConfig,
-    "network": NetworkConfig,
-    "curriculum": BodyRateSchedule,
-    "logger": LoggerConfig,
-}.items():
+_nodes = {"env": EnvConfig, "model": ModelConfig, "network": NetworkConfig, "logger": LoggerConfig}
+for _group, _node in {**_nodes, "curriculum": BodyRateSchedule}.items():
     store.store(group=_group, name="schema", node=_node)

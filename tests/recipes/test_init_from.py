@@ -49,6 +49,25 @@ def test_all_weights_of_a_run_and_nothing_else(trained: Path, capsys: pytest.Cap
         one.close()
 
 
+@pytest.mark.parametrize("source", ["first", "kidney"])
+def test_the_world_model_alone(source: str, trained: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    overrides = [*NUMBERS, f"init_from={trained}"] if source == "first" else [*AS_SHIPPED, "init_from=kidney"]
+    place = f"run_dir={trained.parent}"
+    run, new = (prepared(*overrides, f"{place}/a", "init_behavior=false"), prepared(*overrides[:-1], f"{place}/b"))
+    loaded = prepared(*overrides, f"{place}/c")
+    for name, value in run.learner.agent.named_parameters():
+        if name.startswith(("world_model.encoder.", "world_model.rssm.")):
+            assert torch.equal(value, loaded.learner.agent.get_parameter(name)), name
+        if name.startswith(("actor.", "critic.")):
+            assert torch.equal(value, new.learner.agent.get_parameter(name)), name
+    actors = [list(each.learner.agent.actor.parameters()) for each in (run, loaded)]
+    assert not all(map(torch.equal, *actors))
+    said = capsys.readouterr().out
+    assert ("the world model alone" if source == "first" else "encoder and RSSM of") in said
+    for one in (run, new, loaded):
+        one.close()
+
+
 def test_a_run_with_a_damaged_configuration_is_refused_by_name(trained: Path) -> None:
     (trained / "config.yaml").write_text("env: {")
     with pytest.raises(ValueError, match=r"first/config\.yaml is damaged"):
