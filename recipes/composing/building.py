@@ -148,8 +148,8 @@ def load_initial_weights(learner: WorldModelLearner, config: WorldModelRunConfig
     if not isinstance(env, DroneRacingEnv):
         raise ValueError(f"init_from={source}: this agent was trained on races, and this run has none.")
     load_trained(folder, env, *filter(None, (learner.agent, learner.averaged)), actor=behavior)
-    which = ("encoder, RSSM and actor", "heads and critic") if behavior else ("encoder and RSSM", "all others")
-    return f"weights: {which[0]} of {folder} (init_from=); {which[1]} start untrained"
+    loaded, others = ("encoder, RSSM and actor", "heads and critic") if behavior else ("encoder and RSSM", "all others")
+    return f"weights: {loaded} of {folder} (init_from=); {others} start untrained"
 
 
 def make_learner(
