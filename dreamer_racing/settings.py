@@ -57,7 +57,7 @@ _WHOLE = (int, "int", int | None, "int | None")
 
 
 def setting(default: Any, allowed: Range) -> Any:
-    """Return a dataclass field with a default and a range of allowed values, which is not checked for None."""
+    """Return a dataclass field with a default and a range of allowed values; None is allowed if the type says so."""
     return dataclasses.field(default=default, metadata={ALLOWED: allowed})
 
 
@@ -77,7 +77,7 @@ def check_settings(config: Any, prefix: str = "") -> None:
         value, allowed = getattr(config, field.name), field.metadata.get(ALLOWED)
         if dataclasses.is_dataclass(value):
             check_settings(value, f"{prefix}{field.name}.")
-        elif allowed is not None and value is not None:
+        elif allowed is not None and not (value is None and "None" in str(field.type)):
             check_setting(f"{prefix}{field.name}", value, allowed, whole=field.type in _WHOLE)
 
 

@@ -62,7 +62,10 @@ def main(config: SimToRealConfig) -> None:
         if config.beside == PILOT:
             studies.append((PILOT, partial(PilotFlyer, track, config.preset, config.rate)))
         elif config.beside:
-            others.append(json.loads(Path(config.beside).read_text(encoding="utf-8")))
+            other = json.loads(Path(config.beside).read_text(encoding="utf-8"))
+            if not isinstance(other, dict) or not other.keys() >= {"flights", "provenance"}:
+                raise ValueError(f"beside={config.beside} is no {RESULT} of another study.")
+            others.append(other)
     results = [fly(actor, make, track, config) for actor, make in studies]
     for result, name in zip(results, (RESULT, RESULT_BESIDE), strict=False):
         (folder / name).write_text(json.dumps(result, indent=1) + "\n", encoding="utf-8")

@@ -42,6 +42,7 @@ def test_numbers_of_any_kind_are_taken(change):
         ({"share": True}, "of.share=True: must be a number, above 0 and at most 1."),
         ({"share": [0.5]}, "of.share=[0.5]: must be a number, above 0 and at most 1."),
         ({"share": 1j}, "of.share=1j: must be a number, above 0 and at most 1."),
+        ({"share": None}, "of.share=None: must be a number, above 0 and at most 1."),
         ({"share": 0}, "of.share=0: must be above 0 and at most 1."),
         ({"share": np.float32(1.5)}, "of.share=1.5: must be above 0 and at most 1."),
         ({"share": math.nan}, "of.share=nan: must be above 0 and at most 1."),

@@ -318,7 +318,8 @@ class DroneRace(base.Task):
         self._camera = camera
         self._view: mujoco.Camera | None = None
         self._frame_interval = 1 if camera is None else frame_interval(camera, 1.0 / parameters.control_dt)
-        self._image, self._image_age = np.empty(0), 0  # held image, and its age in control steps
+        # held image, and its age in control steps; one is due at once, as specs are read before the first episode
+        self._image, self._image_age = np.empty(0), self._frame_interval
 
     def action_spec(self, physics: Physics) -> specs.BoundedArray:
         """Return the spec of collective thrust and body rates x, y, z, (4,) in [-1, 1]."""
@@ -379,7 +380,8 @@ class DroneRace(base.Task):
             body_rates=physics.body_rates(),
             target_gate=self.race.target_gate.numpy().copy(),
         )
-        if self._imu is not None:
+        if self._imu_errors is not None:  # specs are read before the first episode begins
+            self._imu = self._imu or Imu(self._imu_errors, physics.ideal_imu, self._generator)
             observation["imu"] = self._imu.sample[0].numpy()
         if self._custom_vector is not None:
             observation["vector"] = self._custom_vector.vector(self._race_state(physics))[0].numpy()

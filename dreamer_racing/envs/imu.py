@@ -11,7 +11,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from dreamer_racing.settings import NOT_NEGATIVE, check_settings, quoted, setting
+from dreamer_racing.settings import NOT_NEGATIVE, check_numbers, check_settings, quoted, setting
 
 IMU_SIZE = 6
 GYRO_RANGE = 34.9
@@ -38,6 +38,7 @@ class ImuErrors:
 
     def __post_init__(self) -> None:
         check_settings(self, "imu.")
+        check_numbers({"imu.delay": self.delay}, {})
 
 
 IMUS = {

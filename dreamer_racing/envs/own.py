@@ -118,7 +118,7 @@ class CustomFunction:
         """Return the observation (N, V); V must be the same in every call."""
         value = self._call(state)
         size = self._size or "V"
-        if value.ndim != 2 or len(value) != self._num_envs or value.shape[1] != (self._size or value.shape[1]):
+        if value.ndim != 2 or len(value) != self._num_envs or value.shape[1] != (self._size or max(value.shape[1], 1)):
             raise self._wrong_shape(value, f"({self._num_envs}, {size}), {size} numbers for each drone")
         self._size = value.shape[1]
         return value
@@ -139,7 +139,8 @@ class CustomFunction:
         if not isinstance(value, Tensor) or value.device != device:
             there = f" on {value.device}" if isinstance(value, Tensor) else ""
             raise ValueError(f"{self.name} returned {type(value).__name__}{there}: must be a tensor on {device}.")
-        value, finite = value.detach().to(torch.float32, copy=True), value.isfinite()
+        value = value.detach().to(torch.float32, copy=True)
+        finite = value.isfinite()
         if device.type == "cuda":
             self._broken.logical_or_(~finite.all())
         elif not finite.all():

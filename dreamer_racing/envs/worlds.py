@@ -41,6 +41,7 @@ from dreamer_racing.envs.tracks import Track, load_track
 from dreamer_racing.machine import is_out_of_memory
 from dreamer_racing.settings import (
     NOT_NEGATIVE,
+    SHARE,
     check_flags,
     check_numbers,
     check_setting,
@@ -212,6 +213,8 @@ class RaceWorlds:
         _check_counts(num_envs, episode_steps=episode_steps, num_threads=num_threads)
         check_flags(evaluation=evaluation, from_pixels=from_pixels)
         check_device(device)
+        if not from_pixels and load_looks(looks) is not None:
+            raise ValueError(f"looks={quoted(looks)}: needs images, but from_pixels=False: leave it out.")
         self.camera, errors = load_camera(camera, camera_rate, from_pixels), load_imu(imu, from_pixels)
         self._process, self._from_pixels = os.getpid(), from_pixels
         self.track, self.evaluation, self.num_envs = load_track(track), evaluation, int(num_envs)
@@ -241,7 +244,7 @@ class RaceWorlds:
         self.has_reset = False
 
     def _make_race(self, weights: RewardWeights | None, episode_steps: int | None, miss_radius: float) -> Race:
-        check_numbers({}, {"miss_radius": miss_radius})
+        check_setting("miss_radius", miss_radius, NOT_NEGATIVE)
         if episode_steps is None:
             episode_steps = round((EVALUATION_TIME if self.evaluation else EPISODE_TIME) / self.parameters.control_dt)
         return Race(
@@ -276,6 +279,7 @@ class RaceWorlds:
 
     def _make_starts(self, beyond_gate: float, at_gate: float, noise: float, on_line: float) -> StartSampler:
         """Make the sampler of start poses, and plan the racing line if episodes begin on it."""
+        check_setting("start_on_line", on_line, SHARE)
         on_line = 0.0 if self.evaluation else on_line
         line = plan_racing_line(self.track, without_randomisation(self.parameters), START_LINE) if on_line else None
         return StartSampler(

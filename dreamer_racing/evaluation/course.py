@@ -28,7 +28,7 @@ class Course:
 
     Every evaluation has the same starts, drones and looks in the first episode of each environment. If ``num_envs`` is
     less than ``episodes``, those of later episodes depend on the episodes before. Samples of the policy come from
-    torch's global generator.
+    torch's global generator, which every evaluation seeds.
 
     Args:
         policy: the policy, on any device.
@@ -50,6 +50,7 @@ class Course:
         """Run the episodes; ``recording`` are arguments of ``evaluate``."""
         self._policy.deterministic = deterministic
         self.base.worlds.seed(self._seed)
+        torch.manual_seed(self._seed)  # of the policy's samples
         return evaluate(self._env, lambda tensordict: act(self._policy, tensordict), self._episodes, **recording)
 
     def close(self) -> None:

@@ -24,6 +24,7 @@ from torch import Tensor
 
 from dreamer_racing.envs.race.gates import CrashCause
 from dreamer_racing.envs.tracks import Track, describe_track, load_track, read_track
+from dreamer_racing.settings import POSITIVE
 
 FINISHED, TIMEOUT = "finished", "timeout"
 CRASHES = tuple(cause.name.lower() for cause in CrashCause if cause is not CrashCause.NONE)
@@ -247,6 +248,8 @@ def read_trajectory(path: str | Path) -> tuple[Trajectory, Track]:
         control_dt, tilt = float(head["control_dt"]), float(head[TILT]) if TILT in head else None
     except ValueError as error:
         raise ValueError(f"{path} has a cell that is not a number: {error}.") from error
+    if control_dt not in POSITIVE:
+        raise ValueError(f"{path}: control_dt is {control_dt:g}, not a number above 0.")
     gate = numbers.pop("target_gate").flatten().long()
     judged = header[-1] == VALUE
     trajectory = Trajectory(

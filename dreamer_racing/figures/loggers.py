@@ -9,6 +9,7 @@ import importlib.util
 import json
 import secrets
 from collections.abc import Mapping
+from contextlib import suppress
 from dataclasses import dataclass
 from enum import Enum
 from pathlib import Path
@@ -87,6 +88,8 @@ class TensorboardRunLogger(TensorboardLogger):
 
     def renew(self) -> None:
         """Continue in a new file after a failed write, because TensorBoard reads nothing behind it in the old one."""
+        with suppress(OSError):  # its file is the one that cannot be written
+            self.experiment.close()
         self.experiment: Any = SummaryWriter(log_dir=self.log_dir)
 
     def log_configuration(self, settings: Mapping[str, Any], text: str) -> None:

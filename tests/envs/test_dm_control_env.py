@@ -334,3 +334,14 @@ def test_another_control_rate() -> None:
     env = load("circle", random=0, control_rate=25)
     assert env.control_timestep() == pytest.approx(0.04)
     assert env.task.race.episode_steps == 500
+
+
+@NEEDS_EGL
+@pytest.mark.parametrize("changes", [{"imu": "exact"}, {"camera_rate": 25}])
+def test_specs_are_known_before_the_first_episode(changes: dict[str, object]) -> None:
+    """TorchRL's wrapper reads them then."""
+    env = DMControlWrapper(load("circle", random=0, from_pixels=True, **changes))
+    flown = env.rollout(2)
+    assert flown["pixels"].shape == (2, 64, 64, 3)
+    assert ("imu" in flown) == ("imu" in changes)
+    env.close()

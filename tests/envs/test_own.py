@@ -162,6 +162,11 @@ def uneven() -> Any:
         ({"reward": "math:sqroot"}, r"module 'math' has no 'sqroot' \(did you mean sqrt\?\)"),
         ({"vector": 3}, "vector=3: must be a function"),
         ({"vector": lambda state: state.time}, r"shape \(3,\): must be \(3, V\), V numbers for each drone"),
+        (
+            {"reward": lambda step: torch.full((3,), 1e300, dtype=torch.float64)},  # finite, but not in float32
+            "reward=<lambda> returned numbers that are not finite",
+        ),
+        ({"vector": lambda state: state.time[:, None][:, :0]}, r"shape \(3, 0\): must be \(3, V\)"),
         ({"vector": lambda state: state.time[:, None] / 0}, "vector=<lambda> returned numbers that are not finite"),
         ({"vector": uneven()}, r"shape \(3, 3\): must be \(3, 2\), 2 numbers"),
         ({"vector": OWN["gate_and_action"], "imu": "exact", "from_pixels": True}, "imu= and vector= cannot be"),

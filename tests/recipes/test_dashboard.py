@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from dreamer_racing.evaluation.trajectory import Trajectory, write_flight
+from dreamer_racing.evaluation.trajectory import Trajectory, read_trajectory, write_flight
 from dreamer_racing.settings import check_settings
 from tests.figures.test_dashboard import circling
 from tests.running_recipes import ROOT, completed, recipe_module, refused
@@ -102,6 +102,15 @@ def test_what_holds_no_flight_is_refused_with_what_would_be_right(runs: Path) ->
     (runs / "young" / "metrics.csv").write_text("env_steps,loss\n")
     with pytest.raises(ValueError, match="metrics.csv holds no trajectory"):
         dashboard.find(config(run="runs/young/metrics.csv"))
+
+
+@pytest.mark.parametrize("value", ["0.0", "nan"])
+def test_a_flight_without_time_is_damaged(value: str, runs: Path) -> None:
+    file = next((runs / "a").rglob("*trajectory.csv"))
+    lines = [f"# control_dt: {value}" if "control_dt" in line else line for line in file.read_text().splitlines()]
+    file.write_text("\n".join(lines) + "\n")
+    with pytest.raises(ValueError, match=f"control_dt is {float(value):g}, not a number above 0"):
+        read_trajectory(file)
 
 
 def test_flights_of_two_tracks_do_not_fit_into_one_scene(runs: Path) -> None:

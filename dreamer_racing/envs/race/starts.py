@@ -139,9 +139,10 @@ class StartSampler:
         if self._start_noise:
             noise = noise.uniform_(-self._start_noise, self._start_noise, generator=self._generator)
         position, attitude = self._disturb(origin, yaw, noise)
+        blocked = self._in_a_frame(position).unsqueeze(-1)  # of another gate than the first
         return StartPose(
-            position=position,
-            attitude=attitude,
+            position=torch.where(blocked, self._start_position, position),
+            attitude=torch.where(blocked, self._start_attitude, attitude),
             linear_velocity=torch.zeros(num, 3, device=self._device, dtype=self._dtype),
             target_gate=torch.zeros(num, dtype=torch.int64, device=self._device),
         )

@@ -548,3 +548,11 @@ def test_half_the_control_rate_flies_twice_as_far_a_step_and_ends_after_the_same
 def test_numbers_out_of_their_range_are_refused(name, value, words):
     with pytest.raises(ValueError, match=words):
         RaceWorlds("circle", 1, from_pixels=False, **{name: value})
+
+
+def test_noisy_starts_of_evaluation_leave_out_frames(monkeypatch):
+    starts = sampler(start_noise=2.0)
+    monkeypatch.setattr(starts, "_in_a_frame", lambda position: torch.arange(len(position)) % 2 == 0)
+    position = starts.sample(100, evaluation=True).position
+    at_start = (position == torch.tensor(CIRCLE.start_position, dtype=torch.float64)).all(-1)
+    assert at_start[::2].all() and not at_start[1::2].any()
