@@ -103,7 +103,8 @@ def jobs(arguments: argparse.Namespace) -> Iterator[tuple[Any, ...]]:
         state, pixels = ((4096,), (256, 1024, 4096)) if on_cuda else ((32, 512, 2048), (32, 64, 256))
         for num_envs in arguments.num_envs or (state if images == "none" else pixels):
             device = "cpu" if images == WARP_CUDA else arguments.device
-            settings = {"preset": arguments.preset, "device": device, "looks": arguments.looks}
+            looks = "nominal" if images == "none" else arguments.looks
+            settings = {"preset": arguments.preset, "device": device, "looks": looks}
             yield measure, images, num_envs, arguments.track, settings, actor, arguments.seconds, arguments.image_size
 
 

@@ -96,12 +96,14 @@ def fly(config: HilConfig) -> int:
             flight = prepare(config, opened)
         ended = flight.loop.run(config.duration, config.patience)  # errors in flight are defects: with traceback
         summary = conclude(config, flight, ended)
-        with plain_disk_errors():
-            opened.close()
-            if config.record:  # before it is printed, which fails if the terminal was closed
-                text = json.dumps(summary, indent=2) + "\n"
-                (flight.folder / STATISTICS).write_text(text, encoding="utf-8")
-        print(*summary_lines(summary), sep="\n")
+        try:  # before it is printed, which fails if the terminal was closed
+            with plain_disk_errors():
+                opened.close()
+                if config.record:
+                    text = json.dumps(summary, indent=2) + "\n"
+                    (flight.folder / STATISTICS).write_text(text, encoding="utf-8")
+        finally:
+            print(*summary_lines(summary), sep="\n")
     wanted = 0 if config.laps is None else config.laps * flight.track.num_gates
     flown = flight.loop.flew and len(summary["passes"]) >= wanted
     return 0 if flown and not ended.startswith("cut") else 1

@@ -55,6 +55,7 @@ _LAYOUT = {
         "motor_time_constant_s?": float,
         "trained_half_widths?": {"gains?": float, "motor_lag?": float},
     },
+    "imu?": {"trained_errors": {"delay": int}},
     "camera?": {
         "width_px": int,
         "height_px": int,

@@ -88,8 +88,8 @@ class TensorboardRunLogger(TensorboardLogger):
 
     def renew(self) -> None:
         """Continue in a new file after a failed write, because TensorBoard reads nothing behind it in the old one."""
-        with suppress(OSError):  # its file is the one that cannot be written
-            self.experiment.close()
+        with suppress(OSError):  # its own `close` would write first, and fail before it ends its thread
+            self.experiment.file_writer.event_writer.close()
         self.experiment: Any = SummaryWriter(log_dir=self.log_dir)
 
     def log_configuration(self, settings: Mapping[str, Any], text: str) -> None:

@@ -43,7 +43,7 @@ from dreamer_racing.settings import POSITIVE, Range, check_choice, check_setting
 logger = logging.getLogger(__name__)
 
 PILOT, IDENTIFY = "pilot", "identify"
-POLLED_IMU = ("msp", "msp_override")  # links whose samples answer the request of the tick before
+POLLED_IMU = ("msp", "msp_override", "betaflight_sitl")  # links whose samples answer the request of the tick before
 PILOT_RATE = 50.0  # Hz
 SIMULATED = ("simulated", "betaflight_sitl")  # links to simulated vehicles, which can hurt nobody
 ARMING = tuple(link for link in BETAFLIGHT if link != "msp_override")  # links that arm by a channel
@@ -265,7 +265,7 @@ def check_flight(config: HilConfig, contract: dict[str, Any], track: Track) -> l
 
 def imu_note(contract: dict[str, Any], link: str) -> list[str]:
     """Return a note if a link's IMU samples are of another age than those of training."""
-    if (imu := contract.get("imu")) is None:
+    if (imu := contract.get("imu")) is None or link == "mavlink":  # its samples are up to a control step old
         return []
     trained, polled = imu["trained_errors"]["delay"], link in POLLED_IMU
     if trained == polled:

@@ -249,7 +249,7 @@ def _clipped_swings(contract: dict[str, Any], limits: SafetyLimits) -> list[str]
         ("thrust_slew", ["collective_thrust"], "m/s²"),
     ):
         swing = max((2.0 * abs(channels[axis]["scale"]) for axis in axes if axis in channels), default=0.0)
-        if (most := getattr(limits, name)) * (1.0 + 1e-6) < swing * rate:
+        if (most := getattr(limits, name)) * (1.0 + 1e-5) < swing * rate:
             notes.append(
                 f"limits.{name}={most:g} allows changes of {most / rate:.3g} {unit} a control step at {rate:g} Hz, and "
                 f"the actor may ask for {swing:.3g}: limits.{name}={swing * rate:g} clips nothing"

@@ -174,7 +174,7 @@ class Safety:
         elif not findings:
             self.state = State.FLYING
             self._armed_at = self._wanted_at = self._now
-            self._left_at = math.inf
+            self._left_at = self._faster_at = math.inf
             self._place = None
 
     def _command(self, tick: Tick) -> Command:
@@ -208,7 +208,8 @@ class Safety:
         self._released_at: float | None = None
         self._ready = False  # the enable was released for long enough, and has not been given since
         self._upright_at = self._wanted_at = self._armed_at = self._delivered_at = self._accepted_at = self._now
-        self._left_at = math.inf  # when it was first seen to move in this flight
+        # when it was first seen to move in this flight: by its position, and by its speed or position
+        self._left_at = self._faster_at = math.inf
         self._moved_at = -math.inf  # when it was last seen to move
         self._place = None
 
@@ -305,6 +306,8 @@ class Safety:
         elif math.dist(seen.position, self._place) > MOVED:
             self._place, self._moved_at = seen.position, self._now
             self._left_at = min(self._left_at, self._now)
+        if seen.speed > limits.start_speed or self._moved_at == self._now:
+            self._faster_at = min(self._faster_at, self._now)
         return findings | self._check_stillness()
 
     def _check_stillness(self) -> Findings:
@@ -313,7 +316,7 @@ class Safety:
         if not self.armed:
             return {}
         findings: Findings = {}
-        frozen = now - max(motion.changed_at, self._left_at)
+        frozen = now - max(motion.changed_at, self._faster_at)
         if motion.repeats and frozen > limits.cut_after:
             findings[Reason.POSE_FROZEN] = (
                 f"poses have been the same for {frozen:.3g} s (allowed: {limits.cut_after:g})"

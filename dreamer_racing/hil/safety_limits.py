@@ -34,7 +34,7 @@ class SafetyLimits:
     start_box: float = setting(0.3, _TOLERANCE)  # m, from the start along each axis, within which it may arm
     start_yaw_tolerance_degrees: float = setting(15.0, _DEGREES)  # difference from that heading within which it may arm
     start_tilt_degrees: float = setting(10.0, _DEGREES)  # tilt from level within which it may arm
-    start_speed: float = setting(0.2, _TOLERANCE)  # m/s above which it does not arm
+    start_speed: float = setting(0.2, _TOLERANCE)  # m/s above which it does not arm, or rises or takes off
     # s for which the enable must be released before it counts: a flicker starts no flight
     release_time: float = setting(0.2, Range(0, 10))
     # s after arming in which no thrust is sent: Betaflight arms at low throttle only

@@ -81,7 +81,7 @@ class Link(Protocol):
         """Return the battery voltages received since the last call, oldest first, without blocking."""
 
     def read_imu(self) -> list[ImuReading]:
-        """Return the IMU samples received up to the last `listen`, oldest first; called only if the flyer uses them."""
+        """Return the IMU samples received up to the last `listen`, oldest first; called at every tick."""
 
     def set_voltage(self, voltage: float) -> None:
         """Convert thrust to throttle by this voltage, V, from now on; no effect if thrust is sent in SI units."""

@@ -117,20 +117,20 @@ def read_table(path: Path) -> Recorded:
         raise ValueError(
             f"{path} lacks {', '.join(lacking if rows else names)}: see `read_table` for the required columns."
         )
-    time, *columns = (_column(path, rows, name) for name in names)
-    force = _column(path, rows, "az") if "az" in rows[0] else np.full(len(rows), np.nan)
+    time, *columns = (_column(path, rows, name, name in names[:5]) for name in names)
+    force = _column(path, rows, "az", False) if "az" in rows[0] else np.full(len(rows), np.nan)
     command = np.column_stack(columns[:4])
     changes = np.flatnonzero(np.concatenate(([True], (np.diff(command, axis=0) != 0).any(1))))
     return _on_grid(time[changes], command[changes], time, np.column_stack(columns[4:]), time, force)
 
 
-def _column(path: Path, rows: Sequence[Mapping[str, str | None]], name: str) -> np.ndarray:
-    """Return a column of finite numbers."""
-    numbers = np.full(len(rows), np.nan)
+def _column(path: Path, rows: Sequence[Mapping[str, str | None]], name: str, complete: bool) -> np.ndarray:
+    """Return a column of numbers; only ``complete`` ones may not be NaN, as where nothing was measured."""
+    numbers = np.full(len(rows), np.inf)
     for index, row in enumerate(rows):
         with suppress(TypeError, ValueError):
             numbers[index] = float(row[name] or "")
-        if not np.isfinite(numbers[index]):
+        if np.isinf(numbers[index]) or (complete and np.isnan(numbers[index])):
             raise ValueError(f"{path}, line {index + 2}: {name} is {row[name]!r}, not a finite number.")
     return numbers
 

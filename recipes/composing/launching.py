@@ -44,7 +44,7 @@ from dreamer_racing.training.checkpoint import RunCheckpointError, newest_sound
 from dreamer_racing.training.directory import PREFIX, RunDirectory, env_steps_of, latest_checkpoint, replace_text
 from dreamer_racing.training.session import Session
 
-TRAINED_ON = ("env.suite", "env.from_pixels", "env.preset", "track", "task", "decoys", "init_from")
+TRAINED_ON = ("env.suite", "env.from_pixels", "env.preset", "track", "task", "decoys", "init_from", "init_behavior")
 """Settings that a resumed run cannot change, besides `OBSERVATION_SETTINGS`."""
 
 
@@ -129,6 +129,7 @@ def check_read(config: DictConfig, overrides: Sequence[str]) -> None:
     flat = [key for key, ramp in config.schedule.items() if isinstance(ramp, DictConfig) and ramp.to is None]
     given = {override_key(override) for override in overrides}
     for names, read, reader in (
+        ("init_behavior", config.init_from is not None, "init_from="),
         ("loss.image_scale loss.image_share", images, "loss=reconstruction or informed, from images"),
         ("loss.privileged_scale", have(State), "loss=privileged or informed"),
         ("loss.barlow_scale", have(Barlow), "loss=decoder_free"),

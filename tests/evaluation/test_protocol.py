@@ -18,7 +18,7 @@ from torchrl.envs import TensorDictPrimer
 from dreamer_racing.envs.torchrl_env import DroneRacingEnv
 from dreamer_racing.envs.tracks import load_track
 from dreamer_racing.evaluation import by_hand, protocol
-from dreamer_racing.evaluation.course import act
+from dreamer_racing.evaluation.course import Course, act
 from dreamer_racing.evaluation.evaluate import CRASHES, evaluate
 from dreamer_racing.evaluation.image_corruptions import CorruptedPolicy, intact
 from dreamer_racing.figures.protocol import mean_bar, plot_conditions, plot_crashes, share_bar
@@ -49,6 +49,26 @@ def test_a_policy_hands_its_action_back_to_where_the_worlds_are():
     on_meta = TensorDict({"memory": torch.zeros(2, 1)}, [2], device="meta")
     assert act(Falling().to("meta"), on_meta)["action"].device.type == "meta"
     assert act(Falling(), TensorDict({"memory": torch.zeros(2, 1)}, [2]))["action"].device.type == "cpu"
+
+
+class Noisy(Falling):
+    """Draws its action when it is not deterministic."""
+
+    def forward(self, tensordict):
+        super().forward(tensordict)
+        return tensordict.set("action", tensordict["action"] - torch.rand(*tensordict.batch_size, 4))
+
+
+def test_samples_of_the_policy_are_by_the_seed_and_belong_to_the_evaluation():
+    course = Course(Noisy(), {"track": "circle", "from_pixels": False, "start_noise": 1.0, "episode_steps": 40}, 3)
+    first = course.evaluate(deterministic=False).episodes
+    torch.manual_seed(5)
+    before = torch.get_rng_state()
+    torch.rand(7)
+    moved = torch.get_rng_state()
+    assert course.evaluate(deterministic=False).episodes == first
+    assert torch.equal(torch.get_rng_state(), moved) and not torch.equal(before, moved)
+    course.close()
 
 
 def by_name(name: str) -> protocol.Condition:

@@ -114,7 +114,10 @@ def test_actions_in_another_order_are_refused():
         check_contract(contract, CIRCLE)
 
 
-@pytest.mark.parametrize(("link", "delay", "said"), [("msp", 1, 0), ("udp", 0, 0), ("msp", 0, 1), ("mavlink", 1, 1)])
+@pytest.mark.parametrize(
+    ("link", "delay", "said"),
+    [("msp", 1, 0), ("udp", 0, 0), ("msp", 0, 1), ("udp", 1, 1), ("betaflight_sitl", 1, 0), ("mavlink", 1, 0)],
+)
 def test_imu_samples_of_another_age_than_in_training_are_noted(link, delay, said):
     notes = imu_note({"imu": {"trained_errors": {"delay": delay}}}, link)
     assert len(notes) == said and all(f"they were {delay} control steps old" in words for words in notes)

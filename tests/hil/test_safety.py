@@ -367,6 +367,14 @@ def test_a_pose_that_is_repeated_as_if_new_while_it_flies_is_cut(claimed):
     assert verdict.words == ("poses have been the same for 0.156 s (allowed: 0.125)",)
 
 
+def test_poses_that_freeze_at_the_first_centimetres_are_cut_as_soon():
+    flight = Flight(velocity_tolerance=4.0, cut_after=0.125).flying()
+    flight.tick(pose={"position": (1.0, 0.0, 0.05), "velocity": (0.0, 0.0, 0.6)})
+    frozen = {"pose": {"position": (1.0, 0.0, 0.06), "velocity": (0.0, 0.0, 0.6)}}
+    assert flight.ticks(5, **frozen).state is State.FLYING
+    assert flight.tick(**frozen).reasons == (Reason.POSE_FROZEN,)
+
+
 @pytest.mark.parametrize("moved", [{"position": (1.2, 1e-9, 0.0)}, {"attitude": turned(2, 1e-3)}])
 def test_a_pose_of_which_anything_changes_is_not_frozen(moved):
     flight = Flight(cut_after=0.125, jump_tolerance=1.0, still_time=60.0).flying()

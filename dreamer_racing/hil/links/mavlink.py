@@ -2,7 +2,8 @@
 
 Not for ArduPilot, see docs/hil_wiring.md. Disarming is forced: it stops the motors in the air too, as the arm switch of
 the other links does. Unlike that switch it works in every mode, so it is not sent before this link has armed the
-vehicle, nor once its HEARTBEAT says that it is armed in a mode that a pilot flies: the flight of a pilot goes on.
+vehicle, nor once its HEARTBEAT says that a pilot has switched the armed vehicle to another mode than offboard: a
+pilot's flight goes on. A mode that PX4 has changed by itself, in a failsafe, is none of a pilot.
 
 Thrust is sent as the motors' command (`ThrustMap.to_motor`), which PX4 passes on unchanged with ``THR_MDL_FAC = 0``.
 
@@ -39,8 +40,11 @@ _LONGEST = Setpoint(GRAVITY, np.ones(3))  # without zeros, which the wire omits 
 PX4 = 12  # MAV_AUTOPILOT_PX4
 MAIN_MODE = 16  # lowest bit of PX4's main mode in HEARTBEAT's custom_mode
 OFFBOARD = 6
-PILOT_MODES = {1: "manual", 2: "altitude", 3: "position", 5: "acro", 7: "stabilized"}
-"""PX4's main modes in which a pilot's sticks fly it."""
+CRITICAL = 5  # MAV_STATE_CRITICAL: PX4 itself has changed the mode, in a failsafe
+MODES = {
+    1: "manual", 2: "altitude", 3: "position", 4: "an automatic", 5: "acro", 7: "stabilized", 11: "altitude cruise",
+}  # fmt: skip
+"""PX4's main modes beside offboard, to which a pilot may switch."""
 ARM_TRIES = 5
 """Arm messages sent from the first armed command on: one may be lost, but a vehicle that has disarmed itself later must
 not be armed again [choice]."""
@@ -118,7 +122,7 @@ class MavlinkTelemetry(Telemetry):
 
     Attributes:
         mode: PX4's main mode; None before a HEARTBEAT, or of another autopilot.
-        pilot_mode: Name of the mode in which a pilot flies the armed vehicle; empty if none is known to.
+        pilot_mode: Name of the mode to which a pilot has switched the armed vehicle; empty if none is known to have.
 
     Raises:
         ImportError: pymavlink is not installed.
@@ -144,7 +148,8 @@ class MavlinkTelemetry(Telemetry):
                 self._add(self.imu_samples, SAMPLES[kind](message))
             elif kind == "HEARTBEAT" and message.get_srcComponent() == AUTOPILOT and message.autopilot == PX4:
                 self.mode = message.custom_mode >> MAIN_MODE & 0xFF
-                self.pilot_mode = PILOT_MODES.get(self.mode, "") if message.base_mode & ARMED else ""
+                by_hand = message.base_mode & ARMED and self.mode != OFFBOARD and message.system_status != CRITICAL
+                self.pilot_mode = MODES.get(self.mode, "another") if by_hand else ""
             elif kind in VOLTAGES and not (kind == "BATTERY_STATUS" and message.id != FIRST_BATTERY):
                 self._add(voltages, VOLTAGES[kind](message))
         return voltages
@@ -152,7 +157,7 @@ class MavlinkTelemetry(Telemetry):
     def refusal(self, armed: bool) -> str:
         """Return why the vehicle does not, or would not, follow commands; empty if no reason is known."""
         if self.pilot_mode:
-            return f"the pilot flies it, in {self.pilot_mode} mode"
+            return f"the pilot has taken over, in {self.pilot_mode} mode"
         return "" if armed or self.mode in (None, OFFBOARD) else "it is not in offboard mode"
 
 

@@ -14,7 +14,7 @@ import pytest
 from dreamer_racing.hil.betaflight.status import BOXIDS_REQUEST, REQUEST
 from dreamer_racing.hil.links import LinkConfig, make_link
 from dreamer_racing.hil.links.link import ASK_EVERY, ChannelLink, TransportLink
-from dreamer_racing.hil.links.mavlink import PILOT_MODES, MavlinkLink
+from dreamer_racing.hil.links.mavlink import MavlinkLink
 from dreamer_racing.hil.links.msp import IMU_REQUEST, OVERRIDE_REQUEST, MspTelemetry
 from dreamer_racing.hil.links.sitl import SerialOverTcp, SitlTransport
 from dreamer_racing.hil.vehicle import Command, Setpoint, at_rest, hover
@@ -246,23 +246,28 @@ def test_one_axis_of_mavlink(mavlink, command, rates):
 
 
 @pytest.mark.parametrize(
-    ("main_mode", "armed", "pilot"),
-    [(3, True, True), (1, True, True), (6, True, False), (4, True, False), (3, False, False)],
-)
-def test_what_a_pilot_flies_is_not_disarmed(mavlink, main_mode, armed, pilot):
+    ("main_mode", "armed", "status", "taken"),
+    [
+        (3, True, 4, "position"), (1, True, 4, "manual"), (4, True, 4, "an automatic"),
+        (11, True, 4, "altitude cruise"), (99, True, 4, "another"), (6, True, 4, ""), (3, True, 5, ""),
+        (3, False, 3, ""),
+    ],
+)  # fmt: skip
+def test_what_a_pilot_has_taken_over_is_not_disarmed(mavlink, main_mode, armed, status, taken):
+    """But it is where PX4 has changed the mode itself, in a failsafe (status 5, critical)."""
     common = pytest.importorskip("pymavlink.dialects.v20.common")
 
-    def hear(mode, is_armed):
-        beat = common.MAVLink_heartbeat_message(2, 12, 128 * is_armed, mode << 16, 4, 3)
+    def hear(mode, is_armed, state):
+        beat = common.MAVLink_heartbeat_message(2, 12, 128 * is_armed, mode << 16, state, 3)
         mavlink._telemetry.read(bytes(beat.pack(common.MAVLink(None, 1, 1))))
 
-    hear(6, False)
+    hear(6, False, 3)
     assert mavlink.refusal == ""
     mavlink.send(turning())
-    hear(main_mode, armed)
-    assert mavlink.refusal == (f"the pilot flies it, in {PILOT_MODES[main_mode]} mode" if pilot else "")
+    hear(main_mode, armed, status)
+    assert mavlink.refusal == (f"the pilot has taken over, in {taken} mode" if taken else "")
     sent = [message.get_type() for message in messages(mavlink.send(at_rest()))]
-    assert sent == ["COMMAND_LONG"] * (not pilot) + ["SET_ATTITUDE_TARGET"]
+    assert sent == ["COMMAND_LONG"] * (not taken) + ["SET_ATTITUDE_TARGET"]
 
 
 def test_mavlink_is_armed_in_offboard_mode_only(mavlink):
