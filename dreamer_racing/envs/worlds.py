@@ -213,8 +213,7 @@ class RaceWorlds:
         _check_counts(num_envs, episode_steps=episode_steps, num_threads=num_threads)
         check_flags(evaluation=evaluation, from_pixels=from_pixels)
         check_device(device)
-        if not from_pixels and load_looks(looks) is not None:
-            raise ValueError(f"looks={quoted(looks)}: needs images, but from_pixels=False: leave it out.")
+        varied = _load_looks(looks, from_pixels)
         self.camera, errors = load_camera(camera, camera_rate, from_pixels), load_imu(imu, from_pixels)
         self._process, self._from_pixels = os.getpid(), from_pixels
         self.track, self.evaluation, self.num_envs = load_track(track), evaluation, int(num_envs)
@@ -232,7 +231,7 @@ class RaceWorlds:
             self._generator,
             device,
             backend,
-            load_looks(looks),
+            varied,
         )
         self.device, self.dtype = self.simulator.device, self.simulator.dtype
         self.race = self._make_race(weights, episode_steps, miss_radius)
@@ -532,6 +531,14 @@ class RaceWorlds:
         self._images = None
         if os.getpid() == self._process:
             self.simulator.close()
+
+
+def _load_looks(looks: str | LooksRandomisation | None, from_pixels: bool) -> LooksRandomisation | None:
+    """Return the randomisation of looks; refuse one without images."""
+    varied = load_looks(looks)
+    if varied is not None and not from_pixels:
+        raise ValueError(f"looks={quoted(looks)}: needs images, but from_pixels=False: leave it out.")
+    return varied
 
 
 def _check_counts(num_envs: int, **others: int | None) -> None:
