@@ -44,7 +44,8 @@ How well each algorithm flies here, what that took, and the command that runs it
   every seed of today's default (all but two stopped by hand). Success swings on Figure 8, by one seed to its end, and
   sampled success on all three, too.
 - **From images alone** both race Circle, where DreamerV3 swings. Latent PPO races Kidney by one seed of two, sooner
-  with a reward for looking at the next gate; DreamerV3 does not, for [reasons partly known](kidney_from_images.md).
+  with a reward for looking at the next gate. On the world model of that run imagination trains a new actor that races;
+  from the beginning DreamerV3 does not, for [reasons partly known](kidney_from_images.md).
 - **PPO and SAC from images** were only begun. PPO from the true state flies three clean laps after 3 to 11 minutes.
 """
 METHOD = """## How success is measured
@@ -81,9 +82,10 @@ SURE = """## How sure, and what is not shown
   defaults](#dreamerv3-earlier-defaults).
 - **Selection.** Settings were chosen on these tracks, by earlier runs of the same seeds, except that DreamerV3 with the
   true state had not been tried with Circle 3 and 4, Kidney 2 and Figure 8 2.
-- **Not shown:** a real drone; agents of images alone but on Circle; today's settings on a GPU; the paper's 20 million
-  env_steps. Of DreamerV3 today only Figure 8 1 and 2 are complete runs. The gate coordinates are this project's own, so
-  the paper's numbers cannot be compared. [More](what_we_know.md#what-is-not-known).
+- **Not shown:** a real drone; agents of images alone on Figure 8, and on Kidney by more than one seed; today's
+  settings on a GPU; the paper's 20 million env_steps. Of DreamerV3 today only Figure 8 1 and 2 are complete runs. The
+  gate coordinates are this project's own, so the paper's numbers cannot be compared.
+  [More](what_we_know.md#what-is-not-known).
 - **Commands** below use today's defaults; the originals are behind *Commands, commits, machine*.
 """
 
