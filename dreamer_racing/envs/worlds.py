@@ -213,7 +213,7 @@ class RaceWorlds:
         _check_counts(num_envs, episode_steps=episode_steps, num_threads=num_threads)
         check_flags(evaluation=evaluation, from_pixels=from_pixels)
         check_device(device)
-        varied = _load_looks(looks, from_pixels)
+        varied = load_looks(looks, from_pixels)
         self.camera, errors = load_camera(camera, camera_rate, from_pixels), load_imu(imu, from_pixels)
         self._process, self._from_pixels = os.getpid(), from_pixels
         self.track, self.evaluation, self.num_envs = load_track(track), evaluation, int(num_envs)
@@ -531,14 +531,6 @@ class RaceWorlds:
         self._images = None
         if os.getpid() == self._process:
             self.simulator.close()
-
-
-def _load_looks(looks: str | LooksRandomisation | None, from_pixels: bool) -> LooksRandomisation | None:
-    """Return the randomisation of looks; refuse one without images."""
-    varied = load_looks(looks)
-    if varied is not None and not from_pixels:
-        raise ValueError(f"looks={quoted(looks)}: needs images, but from_pixels=False: leave it out.")
-    return varied
 
 
 def _check_counts(num_envs: int, **others: int | None) -> None:

@@ -174,7 +174,7 @@ class Safety:
         elif not findings:
             self.state = State.FLYING
             self._armed_at = self._wanted_at = self._now
-            self._left_at = self._faster_at = math.inf
+            self._left_at = self._first_motion_at = math.inf
             self._place = None
 
     def _command(self, tick: Tick) -> Command:
@@ -208,8 +208,8 @@ class Safety:
         self._released_at: float | None = None
         self._ready = False  # the enable was released for long enough, and has not been given since
         self._upright_at = self._wanted_at = self._armed_at = self._delivered_at = self._accepted_at = self._now
-        # when it was first seen to move in this flight: by its position, and by its speed or position
-        self._left_at = self._faster_at = math.inf
+        # when in this flight its position was first seen to change, and its position or its speed
+        self._left_at = self._first_motion_at = math.inf
         self._moved_at = -math.inf  # when it was last seen to move
         self._place = None
 
@@ -301,13 +301,14 @@ class Safety:
             self._upright_at = self._now
         elif self._now - self._upright_at > limits.tilt_time:
             findings[Reason.TILT] = f"it is tilted by {seen.tilt_degrees:.0f}° (allowed: {limits.tilt_max_degrees:g})"
-        if self._place is None:
-            self._place = seen.position
-        elif math.dist(seen.position, self._place) > MOVED:
-            self._place, self._moved_at = seen.position, self._now
+        has_moved = self._place is not None and math.dist(seen.position, self._place) > MOVED
+        if has_moved:
+            self._moved_at = self._now
             self._left_at = min(self._left_at, self._now)
-        if seen.speed > limits.start_speed or self._moved_at == self._now:
-            self._faster_at = min(self._faster_at, self._now)
+        if has_moved or seen.speed > limits.start_speed:
+            self._first_motion_at = min(self._first_motion_at, self._now)
+        if has_moved or self._place is None:
+            self._place = seen.position
         return findings | self._check_stillness()
 
     def _check_stillness(self) -> Findings:
@@ -316,7 +317,7 @@ class Safety:
         if not self.armed:
             return {}
         findings: Findings = {}
-        frozen = now - max(motion.changed_at, self._faster_at)
+        frozen = now - max(motion.changed_at, self._first_motion_at)
         if motion.repeats and frozen > limits.cut_after:
             findings[Reason.POSE_FROZEN] = (
                 f"poses have been the same for {frozen:.3g} s (allowed: {limits.cut_after:g})"

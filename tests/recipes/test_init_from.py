@@ -55,11 +55,11 @@ def test_the_world_model_alone(source: str, trained: Path, capsys: pytest.Captur
     place = f"run_dir={trained.parent}"
     run, new = (prepared(*overrides, f"{place}/a", "init_behavior=false"), prepared(*overrides[:-1], f"{place}/b"))
     loaded = prepared(*overrides, f"{place}/c")
-    for name, value in run.learner.agent.named_parameters():
-        if name.startswith(("world_model.encoder.", "world_model.rssm.")):
-            assert torch.equal(value, loaded.learner.agent.get_parameter(name)), name
-        if name.startswith(("actor.", "critic.")):
-            assert torch.equal(value, new.learner.agent.get_parameter(name)), name
+    begun = "world_model." if source == "first" else ("world_model.encoder.", "world_model.rssm.")
+    for part in ("agent", "averaged"):
+        own, theirs, initial = (getattr(each.learner, part).state_dict() for each in (run, loaded, new))
+        for name, value in own.items():
+            assert torch.equal(value, (theirs if name.startswith(begun) else initial)[name]), (part, name)
     actors = [list(each.learner.agent.actor.parameters()) for each in (run, loaded)]
     assert not all(map(torch.equal, *actors))
     said = capsys.readouterr().out

@@ -171,6 +171,7 @@ def test_what_would_be_ignored_is_refused(overrides: list[str], words: str) -> N
             "crash_weight.to=4.* is for loss.continuation",
         ),
         (["schedule.discount.begin=0.5"], "discount.begin=0.5 is for schedule.discount.to, which is not chosen"),
+        (["init_behavior=false"], "init_behavior=False is for init_from=, which is not chosen"),
         (["schedule.wait_every=9"], "wait_every=9 is for schedule.wait_for_model, which is not chosen"),
     ],
 )

@@ -15,7 +15,7 @@ import torch
 from torch import Tensor
 
 from dreamer_racing.envs.simulator.scene import Camera, gate_materials
-from dreamer_racing.settings import NOT_NEGATIVE, check_settings, setting
+from dreamer_racing.settings import NOT_NEGATIVE, check_settings, quoted, setting
 
 
 @dataclass(frozen=True)
@@ -128,15 +128,16 @@ class LooksSampler:
             getattr(self.looks, field.name).copy_(state_dict[field.name])
 
 
-def load_looks(looks: str | LooksRandomisation | None) -> LooksRandomisation | None:
+def load_looks(looks: str | LooksRandomisation | None, from_pixels: bool = True) -> LooksRandomisation | None:
     """Return the randomisation of a name: None for `nominal`, the default one for `randomised`.
 
     Raises:
-        ValueError: unknown name.
+        ValueError: unknown name, or a randomisation in an environment without images.
     """
-    if looks is None or isinstance(looks, LooksRandomisation):
-        return looks
-    names = {"nominal": None, "randomised": LooksRandomisation()}
-    if not isinstance(looks, str) or looks not in names:
-        raise ValueError(f"looks={looks!r}: use {', '.join(names)}, or a LooksRandomisation.")
-    return names[looks]
+    if looks is None or looks == "nominal":
+        return None
+    if looks != "randomised" and not isinstance(looks, LooksRandomisation):
+        raise ValueError(f"looks={looks!r}: use nominal, randomised, or a LooksRandomisation.")
+    if not from_pixels:
+        raise ValueError(f"looks={quoted(looks)}: needs images, but from_pixels=False: leave it out.")
+    return looks if isinstance(looks, LooksRandomisation) else LooksRandomisation()

@@ -295,6 +295,8 @@ def test_bad_looks_are_refused() -> None:
         load_looks("pretty")
     with pytest.raises(ValueError, match="or a LooksRandomisation"):
         load_looks({"noise": 0.1})
+    with pytest.raises(ValueError, match="looks='randomised': needs images, but from_pixels=False"):
+        RaceWorlds("circle", looks="randomised", from_pixels=False)
     with pytest.raises(ValueError, match="noise=-1.0: must be at least 0"):
         LooksRandomisation(noise=-1.0)
     with pytest.raises(ValueError, match="below 1"):
